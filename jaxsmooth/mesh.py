@@ -1,0 +1,162 @@
+"""The mesh record, its checks, and how values go from nodes to elements and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxsmooth.elements import ElementType, element_type
+
+__all__ = ["Labels", "Mesh", "gather", "scatter_add"]
+
+
+class Labels(eqx.Module):
+    """What a mesh says about its parts; boundary and interface detection respect it.
+
+    Attributes:
+        regions: one int array ``[elements]`` a block: the material or physical group.
+        features: lower-dimensional cells of the file, ``[m, k]`` each.
+        feature_types: their types (``vertex``, ``line``, ``triangle``, …).
+        feature_tags: one int array ``[m]`` each: cells of different tags do not mix.
+    """
+
+    regions: tuple[Int[np.ndarray, " elements"], ...]
+    features: tuple[Int[np.ndarray, "m k"], ...] = ()
+    feature_tags: tuple[Int[np.ndarray, " m"], ...] = ()
+    feature_types: tuple[str, ...] = eqx.field(static=True, default=())
+
+
+class Mesh(eqx.Module):
+    """A finite-element mesh: a frozen pytree whose only differentiable leaf is `points`.
+
+    Attributes:
+        points: coordinates of the nodes ``[nodes, dim]``; their dtype sets the precision.
+        connectivity: one int32 array ``[elements, k]`` an element block.
+        labels: regions and lower-dimensional cells, or None.
+        types: the element type of each block, by meshio's name (static).
+    """
+
+    points: Float[Array, "nodes dim"]
+    connectivity: tuple[Int[Array, "elements k"], ...]
+    labels: Labels | None
+    types: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        points: Any,
+        blocks: Mapping[str, Any] | Sequence[tuple[str, Any]],
+        labels: Labels | None = None,
+    ):
+        """Check and build a mesh.
+
+        Args:
+            points: ``[nodes, dim]`` coordinates, float32 or float64.
+            blocks: ``{"tetra": [elements, k]}`` or a list of such pairs.
+            labels: see `Labels`.
+
+        Raises:
+            ValueError: naming the block, element or node that is wrong.
+        """
+        pairs = list(blocks.items()) if isinstance(blocks, Mapping) else list(blocks)
+        pairs = [(name, np.asarray(nodes)) for name, nodes in pairs]
+        if not pairs:
+            raise ValueError("the mesh has no element blocks; give at least one, such as {'tetra': nodes}")
+        points = _as_points(points)
+        for index, (name, nodes) in enumerate(pairs):
+            _check_block(index, name, nodes, points.shape)
+        self.points = points
+        self.connectivity = tuple(jnp.asarray(nodes.astype(np.int32)) for _, nodes in pairs)
+        self.labels = labels
+        self.types = tuple(name for name, _ in pairs)
+
+    @property
+    def dim(self) -> int:
+        """Dimension of the space and of the elements: 2 or 3."""
+        return self.points.shape[1]
+
+    @property
+    def blocks(self) -> list[tuple[ElementType, Int[Array, "elements k"]]]:
+        """Element type and connectivity of every block."""
+        return [(element_type(n), c) for n, c in zip(self.types, self.connectivity, strict=True)]
+
+    def with_points(self, points: Float[Array, "nodes dim"]) -> Mesh:
+        """The same topology with other coordinates; `points` may be traced by JAX."""
+        return eqx.tree_at(lambda mesh: mesh.points, self, points)
+
+    def with_labels(self, labels: Labels | None) -> Mesh:
+        """The same mesh with other labels."""
+        return eqx.tree_at(lambda m: m.labels, self, labels, is_leaf=lambda x: x is None)
+
+
+def _as_points(points: Any) -> Float[Array, "nodes dim"]:
+    if isinstance(points, jax.core.Tracer):
+        return points
+    array = np.asarray(points)
+    if array.ndim != 2 or array.shape[1] not in (2, 3):
+        raise ValueError(f"points must have shape [nodes, 2] or [nodes, 3], got {list(array.shape)}")
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"points must be real numbers, got dtype {array.dtype}")
+    finite = np.isfinite(array).all(axis=1)
+    if not finite.all():
+        node = int(np.argmin(finite))
+        raise ValueError(
+            f"node {node} has a coordinate that is not finite ({array[node].tolist()}); "
+            f"{int((~finite).sum())} such nodes in all; repair or remove them"
+        )
+    if isinstance(points, jax.Array) and array.dtype.kind == "f":
+        return points
+    # jnp.asarray rejects the big-endian arrays that some readers return
+    dtype = np.float32 if array.dtype.itemsize <= 4 and array.dtype.kind == "f" else np.float64
+    return jnp.asarray(array.astype(dtype))
+
+
+def _check_block(index: int, name: str, nodes: np.ndarray, points_shape: tuple[int, ...]) -> None:
+    kind, where = element_type(name), f"block {index} ({name})"
+    if kind.dim != points_shape[1]:
+        if kind.dim == 2 and points_shape[1] == 3:
+            raise ValueError(
+                f"{where}: surface elements in 3D can't be smoothed; give 2D points or a mesh of volume elements"
+            )
+        raise ValueError(f"{where}: {kind.dim}D elements in {points_shape[1]}D space can't be smoothed")
+    if nodes.ndim != 2 or nodes.shape[1] != kind.k or nodes.dtype.kind not in "iu":
+        raise ValueError(
+            f"{where}: connectivity must be integers of shape [elements, {kind.k}], "
+            f"got {nodes.dtype} {list(nodes.shape)}"
+        )
+    outside = (nodes < 0) | (nodes >= points_shape[0])
+    if outside.any():
+        element, column = np.argwhere(outside)[0]
+        raise ValueError(
+            f"{where}, element {element}: node index {nodes[element, column]} is out of range; "
+            f"the mesh has {points_shape[0]} nodes"
+        )
+    ordered = np.sort(nodes, axis=1)
+    repeated = ordered[:, 1:] == ordered[:, :-1]
+    if repeated.any():
+        element, column = np.argwhere(repeated)[0]
+        raise ValueError(
+            f"{where}, element {element}: node {ordered[element, column]} appears twice; "
+            "split the degenerate element or use the type that fits it"
+        )
+
+
+# --- Work on elements ------------------------------------------------------------------
+
+
+def gather(points: Float[Array, "nodes ..."], nodes: Int[Array, "..."]) -> Float[Array, "..."]:
+    """Values at the nodes of elements.  Indices were checked when the mesh was built."""
+    return points.at[nodes].get(mode="promise_in_bounds")
+
+
+def scatter_add(
+    values: Float[Array, "elements k ..."], nodes: Int[Array, "elements k"], count: int
+) -> Float[Array, "nodes ..."]:
+    """Sum of the element contributions at every node (the assembly)."""
+    start = jnp.zeros((count, *values.shape[nodes.ndim :]), values.dtype)
+    return start.at[nodes].add(values, mode="promise_in_bounds")
