@@ -1,0 +1,280 @@
+"""Which way each node may move: one projector ``[dim, dim]`` a node.
+
+A facet keeps its shape if its nodes move within its plane.  A node may therefore move in the
+null space of the normals of all facets around it that have to be kept: in a plane, along a
+straight edge, or not at all.  That rule needs no search for planes and edges and does not
+depend on numbering.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxsmooth.elements import ElementType, element_type
+from jaxsmooth.mesh import Labels, Mesh
+from jaxsmooth.topology import facet_keys, find_facets
+
+__all__ = ["Constraints", "coordinate_error", "detect_constraints"]
+
+_FLAT, _ROUGH = 1e-4, 2e-2  # radians: bounds of the flatness tolerance
+_SAFETY = 4.0  # noise of a direction, in units of coordinate error over length
+
+
+class Constraints(eqx.Module):
+    """Attributes: orthogonal projectors ``[nodes, dim, dim]`` onto the free directions."""
+
+    projectors: Float[Array, "nodes dim dim"]
+
+    @property
+    def freedom(self) -> np.ndarray:
+        """Free directions of every node ``[nodes]``: 0 held, 1 on a line, 2 in a plane, 3 free."""
+        return np.rint(np.trace(np.asarray(self.projectors), axis1=1, axis2=2)).astype(int)
+
+    @classmethod
+    def hold(cls, mesh: Mesh, nodes: Any) -> Constraints:
+        """Hold the nodes of a mask ``[nodes]`` or an index array, leave all others free."""
+        projectors = np.tile(np.eye(mesh.dim), (len(mesh.points), 1, 1))
+        projectors[_mask(nodes, len(mesh.points))] = 0
+        return cls(jnp.asarray(projectors, mesh.points.dtype))
+
+
+def detect_constraints(
+    mesh: Mesh,
+    *,
+    boundary: str = "slide",
+    interfaces: str = "slide",
+    feature_angle: float = 0.0,
+    flatness: float | None = None,
+    fixed: Any = None,
+) -> Constraints:
+    """Find how every node may move so that the shape of the domain is kept.
+
+    Boundary nodes slide within flat faces and along straight edges and are held elsewhere.
+    So do nodes of interfaces between regions (`Mesh.labels`), of embedded surfaces and lines
+    that the mesh names, and of the borders between boundary cells of different tags.
+
+    Args:
+        mesh: the mesh.
+        boundary: ``"slide"``, or ``"fixed"`` to hold every boundary node.
+        interfaces: the same choice for interfaces between regions.
+        feature_angle: degrees.  A straight fold shallower than this belongs to a curved face,
+            whose nodes are held; by default every straight fold is an edge to slide along.
+        flatness: angle in radians below which facets lie in one plane.  By default it follows
+            from the precision of the coordinates and the size of each facet (1e-4 at least).
+        fixed: nodes to hold besides: a mask ``[nodes]`` or indices.
+
+    Returns:
+        The constraints.
+
+    Raises:
+        ValueError: for an unknown choice, or a mask of another length.
+    """
+    for name, choice in (("boundary", boundary), ("interfaces", interfaces)):
+        if choice not in ("slide", "fixed"):
+            raise ValueError(f"{name} must be 'slide' or 'fixed', got {choice!r}")
+    points = np.asarray(mesh.points, np.float64)
+    count, dim = points.shape
+    noise = _SAFETY * coordinate_error(np.asarray(mesh.points))
+    held = _mask(fixed, count)
+    normals, tangents = _Directions(count, dim), _Directions(count, dim)
+
+    for facets in find_facets(mesh):
+        outer = facets.partner < 0
+        between = ~outer & (facets.partner != facets.region)
+        for chosen, choice in ((outer, boundary), (between, interfaces)):
+            nodes = facets.nodes[chosen]
+            if choice == "fixed":
+                held[nodes] = True
+            else:
+                normals.add(nodes, *_facet_normals(facets.type, points[nodes], noise, flatness))
+    if mesh.labels is not None:
+        _add_features(mesh.labels, points, noise, flatness, normals, tangents, held)
+
+    projectors = np.tile(np.eye(dim), (count, 1, 1))
+    on_facets, free = normals.null_space()
+    if feature_angle > 0:
+        free[normals.fold_angles(on_facets, free) < np.deg2rad(feature_angle)] = 0
+    projectors[on_facets] = free
+    on_lines, line = tangents.common_line()
+    stays = np.einsum("nij,njk,nki->n", projectors[on_lines], line, line) > 1 - 1e-6
+    projectors[on_lines] = line * stays[:, None, None]
+    projectors[held] = 0
+    return Constraints(jnp.asarray(projectors, mesh.points.dtype))
+
+
+def coordinate_error(points: np.ndarray) -> float:
+    """How far a coordinate may be off: by the rounding of its type, or of its file's digits.
+
+    Text files often carry six or seven significant digits; the least number (of five to nine)
+    that reproduces all coordinates is taken for theirs.
+    """
+    values = np.abs(np.asarray(points)[np.asarray(points) != 0])
+    if len(values) == 0:
+        return 0.0
+    single = values.dtype == np.float32 or (values == values.astype(np.float32)).all()
+    error = float(np.finfo(np.float32 if single else np.float64).eps) * float(values.max())
+    values = values.astype(np.float64)
+    unit = 10.0 ** np.floor(np.log10(values))
+    mantissa = values / unit
+    exact = 8 * np.finfo(np.float32 if single else np.float64).eps
+    for decimals in range(4, 9):
+        if (np.abs(mantissa - np.round(mantissa, decimals)) <= exact * mantissa).all():
+            return max(error, 0.5 * 10.0**-decimals * float(unit.max()))
+    return error
+
+
+def _mask(nodes: Any, count: int) -> np.ndarray:
+    mask = np.zeros(count, dtype=bool)
+    if nodes is None:
+        return mask
+    nodes = np.asarray(nodes)
+    if nodes.dtype == bool and nodes.shape != (count,):
+        raise ValueError(f"the mask of fixed nodes has shape {list(nodes.shape)}; the mesh has {count} nodes")
+    if nodes.dtype != bool and nodes.size and not (0 <= nodes.min() and nodes.max() < count):
+        raise ValueError(f"a fixed node is out of range; the mesh has {count} nodes")
+    mask[nodes if nodes.dtype == bool else nodes.astype(int)] = True
+    return mask
+
+
+class _Directions:
+    """Unit vectors gathered at nodes, each with the angle to which it is known.
+
+    A direction v is *normal* to all vectors at a node when the mean square of their cosines
+    with v, each over its own tolerance, is at most 1.
+    """
+
+    def __init__(self, count: int, dim: int):
+        self.square = np.zeros((count, dim, dim))
+        self.number = np.zeros(count)
+        self.parts: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def add(self, nodes: np.ndarray, vectors: np.ndarray, tolerance: np.ndarray) -> None:
+        """Add vectors ``[m, s, dim]`` with tolerances ``[m]`` at all nodes ``[m, k]``."""
+        count, dim = self.square.shape[:2]
+        outer = np.einsum("msi,msj,m->mij", vectors, vectors, 1 / tolerance**2)
+        flat = nodes.reshape(-1)
+        for i in range(dim):
+            for j in range(dim):
+                weight = np.repeat(outer[:, i, j], nodes.shape[1])
+                self.square[:, i, j] += np.bincount(flat, weight, minlength=count)
+        self.number += vectors.shape[1] * np.bincount(flat, minlength=count)
+        self.parts.append((nodes, vectors))
+
+    def _spectrum(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        touched = np.flatnonzero(self.number)
+        values, vectors = np.linalg.eigh(self.square[touched])
+        return touched, values <= self.number[touched, None], vectors
+
+    def null_space(self) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes that have vectors, and the projectors onto what is normal to all of them."""
+        touched, normal, vectors = self._spectrum()
+        return touched, np.einsum("nij,nj,nkj->nik", vectors, normal, vectors)
+
+    def common_line(self) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes that have vectors, and the projector onto their line, or 0 where they disagree."""
+        touched, normal, vectors = self._spectrum()
+        aligned = normal[:, :-1].all(axis=1)
+        top = vectors[..., -1]
+        return touched, np.einsum("ni,nj,n->nij", top, top, aligned)
+
+    def fold_angles(self, touched: np.ndarray, free: np.ndarray) -> np.ndarray:
+        """Angle of the fold at nodes that are free along one line in 3D; infinite elsewhere."""
+        count, dim = self.square.shape[:2]
+        if dim == 2:
+            return np.full(len(touched), np.inf)
+        line = np.zeros((count, 3))
+        line[touched] = np.linalg.eigh(free)[1][..., -1]
+        folded = np.zeros(count, dtype=bool)
+        folded[touched] = np.rint(np.trace(free, axis1=1, axis2=2)) == 1
+        low, high, mean = np.full(count, np.inf), np.full(count, -np.inf), np.zeros((count, 3))
+        for nodes, vectors in self.parts:
+            np.add.at(mean, nodes, vectors.mean(axis=1)[:, None])
+        side = np.cross(line, mean)
+        for nodes, vectors in self.parts:
+            along = np.einsum("msd,mkd->mks", vectors, mean[nodes])
+            across = np.einsum("msd,mkd->mks", vectors, side[nodes])
+            angle = np.arctan2(across, along)
+            np.minimum.at(low, nodes, angle.min(axis=-1))
+            np.maximum.at(high, nodes, angle.max(axis=-1))
+        return np.where(folded, high - low, np.inf)[touched]
+
+
+def _tolerance(noise: float, length: np.ndarray, flatness: float | None) -> np.ndarray:
+    if flatness is not None:
+        return np.full(len(length), float(flatness))
+    return np.clip(noise / np.maximum(length, np.finfo(float).tiny), _FLAT, _ROUGH)
+
+
+def _facet_normals(
+    kind: ElementType, nodes: np.ndarray, noise: float, flatness: float | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals ``[m, q, dim]`` at the quadrature points, and how well they are known."""
+    tangents = np.einsum("mkd,qke->mqde", nodes, kind.slopes)
+    if kind.dim == 1:
+        normals = np.stack([tangents[..., 1, 0], -tangents[..., 0, 0]], axis=-1)
+    else:
+        normals = np.cross(tangents[..., 0], tangents[..., 1])
+    size = np.linalg.norm(normals, axis=-1, keepdims=True)
+    area = (size[..., 0] @ kind.slope_weights) if kind.dim == 2 else None
+    corners = nodes[:, : kind.corners]
+    longest = np.linalg.norm(corners[:, kind.edges[:, 0]] - corners[:, kind.edges[:, 1]], axis=-1).max(axis=1)
+    height = longest if area is None else area / np.maximum(longest, np.finfo(float).tiny)
+    return normals / np.where(size > 0, size, 1), _tolerance(noise, height, flatness)
+
+
+def _add_features(
+    labels: Labels,
+    points: np.ndarray,
+    noise: float,
+    flatness: float | None,
+    normals: _Directions,
+    tangents: _Directions,
+    held: np.ndarray,
+) -> None:
+    """Tagged cells of lower dimension: keep their surfaces, lines, borders and vertices."""
+    count, dim = points.shape
+    edges, edge_tags, ends, end_tags = [], [], [], []
+    for name, nodes, tags in zip(labels.feature_types, labels.features, labels.feature_tags, strict=True):
+        if name == "vertex":
+            held[nodes[:, 0]] = True
+            continue
+        kind = element_type(name)
+        if kind.dim == 2 and dim == 3:
+            normals.add(nodes, *_facet_normals(kind, points[nodes], noise, flatness))
+            sides = nodes[:, kind.segments]
+            edges.append(sides.reshape(-1, 2))
+            edge_tags.append(np.repeat(tags, sides.shape[1]))
+        elif kind.dim == 1:
+            segments = nodes[:, kind.segments].reshape(-1, 2)
+            tangents.add(segments, *_unit_tangents(points[segments], noise, flatness))
+            ends.append(nodes[:, :2].reshape(-1))
+            end_tags.append(np.repeat(tags, 2))
+    if edges:
+        pairs, tags = np.concatenate(edges), np.concatenate(edge_tags)
+        border = pairs[_on_border(facet_keys(pairs, count), tags)]
+        tangents.add(border, *_unit_tangents(points[border], noise, flatness))
+    if ends:
+        nodes, tags = np.concatenate(ends), np.concatenate(end_tags)
+        held[nodes[_on_border(nodes, tags)]] = True
+
+
+def _on_border(keys: np.ndarray, tags: np.ndarray) -> np.ndarray:
+    """True where a key occurs once, or with more than one tag."""
+    _, group, number = np.unique(keys, return_inverse=True, return_counts=True)
+    total = np.bincount(group, tags)
+    square = np.bincount(group, tags.astype(float) ** 2)
+    mixed = square * number - total**2 > 0.5
+    return (mixed | (number == 1))[group]
+
+
+def _unit_tangents(
+    ends: np.ndarray, noise: float, flatness: float | None
+) -> tuple[np.ndarray, np.ndarray]:
+    vectors = ends[:, 1] - ends[:, 0]
+    length = np.linalg.norm(vectors, axis=1)
+    return (vectors / np.where(length > 0, length, 1)[:, None])[:, None], _tolerance(noise, length, flatness)

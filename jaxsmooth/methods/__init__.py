@@ -1,0 +1,1 @@
+"""Smoothing methods: frozen records that say how one step is made."""

@@ -1,0 +1,58 @@
+"""The interface of a smoothing method."""
+
+from __future__ import annotations
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxsmooth.constraints import Constraints
+from jaxsmooth.mesh import Mesh
+from jaxsmooth.patches import Evaluation, PatchGuard, evaluate
+
+__all__ = ["Method", "Proposal", "Step"]
+
+
+class Proposal(NamedTuple):
+    """A displacement ``[nodes, dim]`` and what it cost: solver iterations, relative residual."""
+
+    move: Float[Array, "nodes dim"]
+    iterations: Int[Array, ""]
+    residual: Float[Array, ""]
+
+
+class Step(NamedTuple):
+    """One step: the new points ``[nodes, dim]``, their evaluation, and counts."""
+
+    points: Float[Array, "nodes dim"]
+    evaluation: Evaluation
+    iterations: Int[Array, ""]
+    residual: Float[Array, ""]
+    shortened: Int[Array, ""]
+
+
+class Method(eqx.Module):
+    """How one step is made: a method proposes a displacement, its guard accepts what is fit.
+
+    A new method is a subclass with `propose`, and a line in the table of methods.
+    """
+
+    guard: eqx.AbstractVar[PatchGuard | None]
+
+    @abc.abstractmethod
+    def propose(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Proposal:
+        """A displacement of all nodes within the constraints."""
+
+    def step(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Step:
+        """Propose and guard: pure, jittable and differentiable in points and parameters."""
+        proposal = self.propose(mesh, constraints, before)
+        if self.guard is None:
+            points, after = mesh.points + proposal.move, None
+            after = evaluate(mesh.with_points(points))
+            shortened = jnp.int32(0)
+        else:
+            points, after, shortened, _ = self.guard(mesh, proposal.move, before)
+        return Step(points, after, proposal.iterations, proposal.residual, shortened)

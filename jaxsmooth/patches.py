@@ -1,0 +1,130 @@
+"""Patches (the elements around a node), the evaluation of a mesh, and the patch guard."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsmooth.mesh import Mesh, gather
+from jaxsmooth.quality import min_jacobian, shape_quality
+
+__all__ = ["Evaluation", "Guarded", "PatchGuard", "evaluate", "patch_mean", "patch_min"]
+
+Blocks = tuple[Float[Array, " elements"], ...]
+Field = Float[Array, "nodes dim"]
+
+
+class Evaluation(NamedTuple):
+    """Shape quality and least Jacobian determinant of every element, block by block."""
+
+    quality: Blocks
+    jacobian: Blocks
+
+
+def evaluate(mesh: Mesh, beta: Float[Array, ""] | float = 2.0) -> Evaluation:
+    """Quality (Eqs. 1–5) and validity of all elements."""
+    found = []
+    for kind, nodes in mesh.blocks:
+        corners = gather(mesh.points, nodes)
+        shape = jax.vmap(partial(shape_quality, kind, beta=beta))(corners)
+        found.append((shape, jax.vmap(partial(min_jacobian, kind))(corners)))
+    return Evaluation(*(tuple(part) for part in zip(*found, strict=True)))
+
+
+def patch_min(mesh: Mesh, values: Blocks) -> Float[Array, " nodes"]:
+    """Least value of each patch; +inf at nodes without elements."""
+    least = jnp.full(len(mesh.points), jnp.inf, mesh.points.dtype)
+    for (_, nodes), value in zip(mesh.blocks, values, strict=True):
+        least = least.at[nodes].min(value[:, None], mode="promise_in_bounds")
+    return least
+
+
+def patch_mean(mesh: Mesh, values: Blocks) -> Float[Array, " nodes"]:
+    """Mean value of each patch; 0 at nodes without elements."""
+    total = jnp.zeros((len(mesh.points), 2), mesh.points.dtype)
+    for (_, nodes), value in zip(mesh.blocks, values, strict=True):
+        pair = jnp.stack([value, jnp.ones_like(value)], axis=-1)
+        total = total.at[nodes].add(pair[:, None], mode="promise_in_bounds")
+    return total[:, 0] / jnp.maximum(total[:, 1], 1)
+
+
+class Guarded(NamedTuple):
+    """Attributes: new points; their evaluation; nodes whose move was shortened; sweeps taken."""
+
+    points: Field
+    evaluation: Evaluation
+    shortened: Int[Array, ""]
+    sweeps: Int[Array, ""]
+
+
+class PatchGuard(eqx.Module):
+    """Eq. 34 in a form that does not depend on node numbering.
+
+    All nodes move; where an element ends below γ times the least quality that the patch of one
+    of its moving nodes had, or turns inverted, the moves of its nodes are halved, and after
+    `halvings` times taken back; until no element offends.  It ends, because nodes that do not
+    move offend nobody: that is the old mesh.  A patch that was inverted may not get worse.
+
+    The accepted fractions of the moves are constants for differentiation.
+
+    Attributes:
+        gamma: γ of Eq. 34.
+        halvings: how often a move is halved before it is taken back.
+    """
+
+    gamma: Float[Array, ""] | float = 0.8
+    halvings: int = eqx.field(static=True, default=5)
+
+    def threshold(self, least: Float[Array, " nodes"]) -> Float[Array, " nodes"]:
+        """The quality that all elements around a moving node must keep."""
+        return jnp.where(least > 0, self.gamma * least, least)
+
+    def __call__(self, mesh: Mesh, move: Field, before: Evaluation, beta=2.0) -> Guarded:
+        """Move the nodes of `mesh` by `move` ``[nodes, dim]``, as far as the patches allow."""
+        stopped = jax.lax.stop_gradient
+        frozen, plain, start = mesh.with_points(stopped(mesh.points)), stopped(move), stopped(before)
+        floor = self.threshold(patch_min(frozen, start.quality))
+
+        def offenders(count, after):
+            """Nodes of elements that offend; a node that does not move has no condition."""
+            limit = jnp.where(count <= self.halvings, floor, -jnp.inf)
+            nodes_bad = jnp.zeros(count.shape, bool)
+            for (_, nodes), q, det, old in zip(
+                mesh.blocks, after.quality, after.jacobian, start.jacobian, strict=True
+            ):
+                # written so that NaN offends
+                fine = (q >= gather(limit, nodes).max(axis=1)) & ((det > 0) | (old <= 0))
+                nodes_bad = nodes_bad.at[nodes].max(~fine[:, None], mode="promise_in_bounds")
+            return nodes_bad
+
+        def sweep(state):
+            count, _, bad, sweeps = state
+            count = count + bad
+            after = evaluate(moved(frozen, plain, self.fraction(count)), beta)
+            return count, after, offenders(count, after), sweeps + 1
+
+        def unfinished(state):
+            count, _, bad, _ = state
+            return (bad & (count <= self.halvings)).any()
+
+        count = jnp.zeros(len(mesh.points), jnp.int32)
+        after = evaluate(moved(frozen, plain, self.fraction(count)), beta)
+        state = (count, after, offenders(count, after), jnp.int32(1))
+        count, after, _, sweeps = jax.lax.while_loop(unfinished, sweep, state)
+        points = moved(mesh, move, self.fraction(count)).points
+        return Guarded(points, after, (count > 0).sum(), sweeps)
+
+    def fraction(self, count: Int[Array, " nodes"]) -> Float[Array, " nodes"]:
+        """The part of its move that a node makes after `count` objections."""
+        return jnp.where(count > self.halvings, 0.0, 0.5**count)
+
+
+def moved(mesh: Mesh, move: Field, fraction: Float[Array, " nodes"]) -> Mesh:
+    """The mesh with every node moved by a fraction of `move`."""
+    scaled = jnp.where(fraction[:, None] > 0, move * fraction[:, None].astype(move.dtype), 0)
+    return mesh.with_points(mesh.points + scaled)
