@@ -78,11 +78,12 @@ class PatchGuard(eqx.Module):
     """
 
     gamma: Float[Array, ""] | float = 0.8
+    poor: Float[Array, ""] | float = 0.2
     halvings: int = eqx.field(static=True, default=5)
 
     def threshold(self, least: Float[Array, " nodes"]) -> Float[Array, " nodes"]:
         """The quality that all elements around a moving node must keep."""
-        return jnp.where(least > 0, self.gamma * least, least)
+        return jnp.minimum(least, jnp.maximum(self.gamma * least, self.poor))
 
     def __call__(self, mesh: Mesh, move: Field, before: Evaluation, beta=2.0) -> Guarded:
         """Move the nodes of `mesh` by `move` ``[nodes, dim]``, as far as the patches allow."""
@@ -90,23 +91,20 @@ class PatchGuard(eqx.Module):
         frozen, plain, start = mesh.with_points(stopped(mesh.points)), stopped(move), stopped(before)
         floor = self.threshold(patch_min(frozen, start.quality))
 
-        def offenders(count, after):
-            """Nodes of elements that offend; a node that does not move has no condition."""
-            limit = jnp.where(count <= self.halvings, floor, -jnp.inf)
-            nodes_bad = jnp.zeros(count.shape, bool)
-            for (_, nodes), q, det, old in zip(
-                mesh.blocks, after.quality, after.jacobian, start.jacobian, strict=True
-            ):
-                # written so that NaN offends
-                fine = (q >= gather(limit, nodes).max(axis=1)) & ((det > 0) | (old <= 0))
-                nodes_bad = nodes_bad.at[nodes].max(~fine[:, None], mode="promise_in_bounds")
-            return nodes_bad
+        def offenders(after):
+            """Nodes whose patch offends; of an element that turns inverted, all nodes."""
+            least = patch_min(frozen, after.quality)
+            bad = ~(least >= floor)  # so written, NaN offends
+            for (_, nodes), det, old in zip(mesh.blocks, after.jacobian, start.jacobian, strict=True):
+                broken = ~((det > 0) | (old <= 0))
+                bad = bad.at[nodes].max(broken[:, None], mode="promise_in_bounds")
+            return bad
 
         def sweep(state):
             count, _, bad, sweeps = state
             count = count + bad
             after = evaluate(moved(frozen, plain, self.fraction(count)), beta)
-            return count, after, offenders(count, after), sweeps + 1
+            return count, after, offenders(after), sweeps + 1
 
         def unfinished(state):
             count, _, bad, _ = state
@@ -114,7 +112,7 @@ class PatchGuard(eqx.Module):
 
         count = jnp.zeros(len(mesh.points), jnp.int32)
         after = evaluate(moved(frozen, plain, self.fraction(count)), beta)
-        state = (count, after, offenders(count, after), jnp.int32(1))
+        state = (count, after, offenders(after), jnp.int32(1))
         count, after, _, sweeps = jax.lax.while_loop(unfinished, sweep, state)
         points = moved(mesh, move, self.fraction(count)).points
         return Guarded(points, after, (count > 0).sum(), sweeps)
