@@ -425,14 +425,27 @@ class ElementType:
         return np.array(frames)
 
     @cached_property
+    def facet_tangents(self) -> Array:
+        """Natural derivatives ``[s, k, dim − 1]`` at the quadrature points of all facets."""
+        rows = []
+        for group in self.facets:
+            for nodes in group.nodes:
+                spread = np.zeros((len(group.type.slopes), self.k, self.dim - 1))
+                spread[:, nodes] = group.type.slopes
+                rows.append(spread)
+        return np.concatenate(rows)
+
+    @cached_property
+    def facet_weights(self) -> Array:
+        """Natural quadrature weights ``[s]`` that go with `facet_tangents`."""
+        return np.concatenate([np.tile(g.type.slope_weights, len(g.nodes)) for g in self.facets])
+
+    @cached_property
     def ideal_surface(self) -> float:
         """Perimeter or surface area of the ideal element of unit measure (Eqs. 3, 4)."""
-        total = 0.0
-        for group in self.facets:
-            tangents = np.einsum("fkd,qke->fqde", self.ideal[group.nodes], group.type.slopes)
-            gram = np.einsum("fqda,fqdb->fqab", tangents, tangents)
-            total += float((np.sqrt(np.linalg.det(gram)) * group.type.slope_weights).sum())
-        return total
+        tangents = np.einsum("kd,ske->sde", self.ideal, self.facet_tangents)
+        gram = np.einsum("sda,sdb->sab", tangents, tangents)
+        return float(np.sqrt(np.linalg.det(gram)) @ self.facet_weights)
 
     @cached_property
     def slopes(self) -> Array:
