@@ -135,7 +135,7 @@ def _mask(nodes: Any, count: int) -> np.ndarray:
     nodes = np.asarray(nodes)
     if nodes.dtype == bool and nodes.shape != (count,):
         raise ValueError(f"the mask of fixed nodes has shape {list(nodes.shape)}; the mesh has {count} nodes")
-    if nodes.dtype != bool and nodes.size and not (0 <= nodes.min() and nodes.max() < count):
+    if nodes.dtype != bool and nodes.size and not (nodes.min() >= 0 and nodes.max() < count):
         raise ValueError(f"a fixed node is out of range; the mesh has {count} nodes")
     mask[nodes if nodes.dtype == bool else nodes.astype(int)] = True
     return mask
@@ -272,9 +272,7 @@ def _on_border(keys: np.ndarray, tags: np.ndarray) -> np.ndarray:
     return (mixed | (number == 1))[group]
 
 
-def _unit_tangents(
-    ends: np.ndarray, noise: float, flatness: float | None
-) -> tuple[np.ndarray, np.ndarray]:
+def _unit_tangents(ends: np.ndarray, noise: float, flatness: float | None) -> tuple[np.ndarray, np.ndarray]:
     vectors = ends[:, 1] - ends[:, 0]
     length = np.linalg.norm(vectors, axis=1)
     return (vectors / np.where(length > 0, length, 1)[:, None])[:, None], _tolerance(noise, length, flatness)

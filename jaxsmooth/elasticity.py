@@ -44,9 +44,7 @@ class Linearised(NamedTuple):
     volumes: Float[Array, " q"]
 
 
-def linearise(
-    kind: ElementType, nodes: Float[Array, "k dim"], measure: Float[Array, ""]
-) -> Linearised:
+def linearise(kind: ElementType, nodes: Float[Array, "k dim"], measure: Float[Array, ""]) -> Linearised:
     """Gradients and volumes of one element with the nodes ``[k, dim]``.
 
     Absolute Jacobian determinants keep K positive semi-definite where an element is inverted;

@@ -18,7 +18,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-__all__ = ["ElementType", "FacetGroup", "TYPES", "element_type", "supported"]
+__all__ = ["TYPES", "ElementType", "FacetGroup", "element_type", "supported"]
 
 Array = np.ndarray
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsmooth.small import cofactors, determinant, norm, solve_regular
+from jaxsmooth.small import determinant, norm, solve_regular
 
 __all__ = ["fit", "rotation", "rotation_svd", "target_element"]
 

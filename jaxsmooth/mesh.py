@@ -121,7 +121,7 @@ def _check_block(index: int, name: str, nodes: np.ndarray, points_shape: tuple[i
     if kind.dim != points_shape[1]:
         if kind.dim == 2 and points_shape[1] == 3:
             raise ValueError(
-                f"{where}: surface elements in 3D can't be smoothed; give 2D points or a mesh of volume elements"
+                f"{where}: surface elements in 3D can't be smoothed; give 2D points or volume elements"
             )
         raise ValueError(f"{where}: {kind.dim}D elements in {points_shape[1]}D space can't be smoothed")
     if nodes.ndim != 2 or nodes.shape[1] != kind.k or nodes.dtype.kind not in "iu":
@@ -149,7 +149,7 @@ def _check_block(index: int, name: str, nodes: np.ndarray, points_shape: tuple[i
 # --- Work on elements ------------------------------------------------------------------
 
 
-def gather(points: Float[Array, "nodes ..."], nodes: Int[Array, "..."]) -> Float[Array, "..."]:
+def gather(points: Float[Array, "nodes ..."], nodes: Int[Array, ...]) -> Float[Array, ...]:
     """Values at the nodes of elements.  Indices were checked when the mesh was built."""
     return points.at[nodes].get(mode="promise_in_bounds")
 

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jax.ad_checkpoint import checkpoint_name
+from jaxtyping import Array, Float, Int
 
 from jaxsmooth.mesh import Mesh, gather
 from jaxsmooth.quality import min_jacobian, shape_quality
@@ -114,6 +115,7 @@ class PatchGuard(eqx.Module):
         after = evaluate(moved(frozen, plain, self.fraction(count)), beta)
         state = (count, after, offenders(after), jnp.int32(1))
         count, after, _, sweeps = jax.lax.while_loop(unfinished, sweep, state)
+        count = checkpoint_name(count, "accepted")
         points = moved(mesh, move, self.fraction(count)).points
         return Guarded(points, after, (count > 0).sum(), sweeps)
 

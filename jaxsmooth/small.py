@@ -46,9 +46,7 @@ def power(base: Float[Array, ...], exponent: float) -> Float[Array, ...]:
     return jnp.where(positive, jnp.where(positive, base, 1) ** exponent, 0)
 
 
-def solve_regular(
-    a: Float[Array, "dim dim"], b: Float[Array, " dim"], floor: float
-) -> Float[Array, " dim"]:
+def solve_regular(a: Float[Array, "dim dim"], b: Float[Array, " dim"], floor: float) -> Float[Array, " dim"]:
     """``a⁻¹ b`` for symmetric non-negative ``a``; zero where ``det a ≤ floor · (tr a)ᵈⁱᵐ``."""
     det, scale = determinant(a), jnp.trace(a)
     regular = det > floor * scale ** a.shape[-1]

@@ -1,1 +1,19 @@
 """Smoothing methods: frozen records that say how one step is made."""
+
+from collections.abc import Callable
+from functools import partial
+
+from jaxsmooth.methods.base import Method, Proposal, Step
+from jaxsmooth.methods.elastic import Elastic
+from jaxsmooth.methods.laplacian import Laplacian
+
+__all__ = ["METHODS", "Elastic", "Laplacian", "Method", "Proposal", "Step"]
+
+METHODS: dict[str, Callable[[], Method]] = {
+    "elastic": Elastic,
+    "elastic-extended": partial(Elastic, extended=True),
+    "laplacian": Laplacian,
+    "smart-laplacian": partial(Laplacian, smart=True),
+    "weighted-laplacian": partial(Laplacian, weighted=True),
+    "smart-weighted-laplacian": partial(Laplacian, smart=True, weighted=True),
+}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -11,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxsmooth.constraints import Constraints
 from jaxsmooth.mesh import Mesh
-from jaxsmooth.patches import Evaluation, PatchGuard, evaluate
+from jaxsmooth.patches import Evaluation, Guarded, evaluate
 
 __all__ = ["Method", "Proposal", "Step"]
 
@@ -40,7 +41,11 @@ class Method(eqx.Module):
     A new method is a subclass with `propose`, and a line in the table of methods.
     """
 
-    guard: eqx.AbstractVar[PatchGuard | None]
+    guard: eqx.AbstractVar[Callable[..., Guarded] | None]
+
+    def prepare(self, mesh: Mesh) -> Method:
+        """Host-side work on the topology, done once before the first step; by default none."""
+        return self
 
     @abc.abstractmethod
     def propose(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Proposal:

@@ -15,7 +15,7 @@ from jaxsmooth.fitting import target_element
 from jaxsmooth.mesh import Mesh, gather, scatter_add
 from jaxsmooth.methods.base import Method, Proposal
 from jaxsmooth.patches import Evaluation, PatchGuard, patch_mean
-from jaxsmooth.quality import measure
+from jaxsmooth.quality import measure, shape_quality
 from jaxsmooth.solve import solve_projected
 
 __all__ = ["Elastic"]
@@ -48,8 +48,8 @@ class Elastic(Method):
         count = len(mesh.points)
         force = jnp.zeros_like(mesh.points)
         blocks = []
-        least = jnp.stack([q.min() for q in before.quality]).min()
-        for (kind, nodes), q, size in zip(mesh.blocks, before.quality, target_measures(mesh), strict=True):
+        weights = self.priorities(mesh) if self.extended else (None,) * len(mesh.blocks)
+        for (kind, nodes), weight, size in zip(mesh.blocks, weights, target_measures(mesh), strict=True):
             corners = gather(mesh.points, nodes)
             ideal = jnp.asarray(kind.ideal, corners.dtype)
             scale = self.alpha * size ** (1 / kind.dim)
@@ -57,7 +57,7 @@ class Elastic(Method):
             elements = jax.vmap(partial(linearise, kind))(corners, size)
             pull = jax.vmap(element_force, in_axes=(0, 0, None))(elements, target - corners, self.material)
             if self.extended:
-                pull = pull * self.priority(q, least)[:, None, None]
+                pull = pull * weight[:, None, None]
             force = force + scatter_add(pull, nodes, count)
             blocks.append(ElementBlock.cut(nodes, elements))
         operator = Operator(tuple(blocks), self.material)
@@ -73,10 +73,12 @@ class Elastic(Method):
         )
 
     @staticmethod
-    def priority(q: Float[Array, " elements"], least: Float[Array, ""]) -> Float[Array, " elements"]:
+    def priorities(mesh: Mesh) -> tuple[Float[Array, " elements"], ...]:
         """(1 − q) / (1 − q_min) of Eq. 35; zero where all elements are ideal."""
-        gap = 1 - least
-        return jnp.where(gap > 0, (1 - q) / jnp.where(gap > 0, gap, 1), 0)
+        q = tuple(jax.vmap(partial(shape_quality, k))(gather(mesh.points, n)) for k, n in mesh.blocks)
+        gap = 1 - jnp.stack([part.min() for part in q]).min()
+        perfect = gap <= 0
+        return tuple(jnp.where(perfect, 0, (1 - part) / jnp.where(perfect, 1, gap)) for part in q)
 
 
 def target_measures(mesh: Mesh) -> tuple[Float[Array, " elements"], ...]:

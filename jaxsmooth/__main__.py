@@ -1,0 +1,7 @@
+"""``python -m jaxsmooth`` is the command line."""
+
+import sys
+
+from jaxsmooth.cli import main
+
+sys.exit(main())

@@ -1,0 +1,137 @@
+"""Whether the cells of a file make a mesh; messages name what its user finds in the file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from meshio._mesh import topological_dimension
+
+from jaxsmooth.elements import TYPES, element_type, supported
+
+__all__ = [
+    "SYNONYMS",
+    "MeshFileError",
+    "check_cells",
+    "check_points",
+    "dimension",
+    "element_dim",
+    "in_plane",
+]
+
+# meshio refuses to build cells of a type whose dimension it doesn't list.  These gaps of its
+# table (5.3.5; named in its `__all__` but not exported) are filled once, where nothing is listed.
+for _name, _dim in {
+    "wedge15": 3,
+    "pyramid13": 3,
+    "tetra4": 3,
+    "tetra8": 3,
+    "tetra14": 3,
+    "hexahedron9": 3,
+    "hexahedron24": 3,
+    "hexahedron1331": 3,
+    "triangle7": 2,
+    "quad5": 2,
+    "quad6": 2,
+}.items():
+    topological_dimension.setdefault(_name, _dim)
+
+SYNONYMS = {"tetra4": "tetra"}  # some of meshio's readers use another name
+
+
+class MeshFileError(ValueError):
+    """A mesh that can't be read, used or written; the message is one sentence for its user."""
+
+
+def dimension(name: str) -> int:
+    """Dimension of the cells of a type that meshio knows."""
+    if name in TYPES:
+        return TYPES[name].dim
+    return 3 if name.startswith("polyhedron") else topological_dimension.get(name, 3)
+
+
+def check_points(points: np.ndarray) -> None:
+    """Raise `MeshFileError` where coordinates are missing or not finite."""
+    if points.ndim != 2 or points.shape[1] not in (2, 3) or points.dtype.kind not in "fiu":
+        raise MeshFileError(
+            f"the mesh has points of shape {list(points.shape)} ({points.dtype}); "
+            "each needs 2 or 3 real coordinates"
+        )
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        node = int(np.argmin(finite))
+        raise MeshFileError(
+            f"node {node} (counted from 0) has a coordinate that is not finite ({points[node].tolist()}), "
+            f"{int((~finite).sum())} such nodes in all; repair or remove them"
+        )
+
+
+def element_dim(cells: Sequence[tuple[str, Any]]) -> int:
+    """The highest dimension among the cells; raises `MeshFileError` below 2."""
+    dim = max((dimension(name) for name, data in cells if len(data)), default=0)
+    if dim < 2:
+        found = {name: 0 for name, data in cells if len(data)}
+        for name, data in cells:
+            if len(data):
+                found[name] += len(data)
+        held = ", ".join(f"{n} {name}" for name, n in found.items()) or "no cells"
+        raise MeshFileError(
+            f"the mesh has no volume elements and no plane ones (it has {held}), nothing to smooth"
+        )
+    return dim
+
+
+def check_cells(cells: Sequence[tuple[str, Any]], chosen: Sequence[int], count: int) -> None:
+    """Raise `MeshFileError` where the chosen blocks aren't sound elements of `count` nodes."""
+    strange: dict[str, int] = {}
+    for k in chosen:
+        name, data = cells[k]
+        if name not in supported():
+            strange[name] = strange.get(name, 0) + len(data)
+    if strange:
+        raise MeshFileError(
+            f"cell type not supported: {', '.join(f'{name} ({n} cells)' for name, n in strange.items())}; "
+            f"convert these cells to {', '.join(supported(dimension(next(iter(strange)))))}"
+        )
+    first = np.cumsum([0] + [len(data) for _, data in cells])
+    for k in chosen:
+        name, nodes = cells[k][0], np.asarray(cells[k][1])
+        if nodes.ndim != 2 or nodes.shape[1] != element_type(name).k:
+            raise MeshFileError(f"cell block {k} ({name}) doesn't have {element_type(name).k} nodes a cell")
+        outside = (nodes < 0) | (nodes >= count)
+        if outside.any():
+            row, column = np.argwhere(outside)[0]
+            raise MeshFileError(
+                f"{_cell(first, k, int(row), name)} refers to node {nodes[row, column]}, which is out of "
+                f"range (the file has {count} nodes, counted from 0); repair the connectivity"
+            )
+        ordered = np.sort(nodes, axis=1)
+        twice = ordered[:, 1:] == ordered[:, :-1]
+        if twice.any():
+            row, column = np.argwhere(twice)[0]
+            raise MeshFileError(
+                f"{_cell(first, k, int(row), name)} has node {ordered[row, column]} twice, "
+                f"{int(twice.any(axis=1).sum())} such cells in this block; "
+                "split the degenerate elements or use the type that fits them"
+            )
+
+
+def _cell(first: np.ndarray, block: int, row: int, name: str) -> str:
+    return f"cell {first[block] + row} of the file ({name} {row} of cell block {block}, counted from 0)"
+
+
+def in_plane(points: np.ndarray, numbering: Sequence[np.ndarray], dim: int) -> np.ndarray:
+    """Points ``[nodes, dim]`` of elements of this dimension; raises `MeshFileError` for surfaces."""
+    if dim == 3 and points.shape[1] == 2:
+        raise MeshFileError("the file has volume elements but only two coordinates a node; it needs three")
+    if dim == 3 or points.shape[1] == 2:
+        return points
+    used = points[np.unique(np.concatenate([nodes.ravel() for nodes in numbering]))]
+    # files written with nine digits or so are still plane
+    if np.ptp(used[:, 2]) > 1e-9 * np.ptp(used[:, :2], axis=0).max():
+        raise MeshFileError(
+            "the mesh is a surface in 3D (plane elements whose z is not constant), which can't be smoothed; "
+            "give volume elements, or a plane mesh in x and y"
+        )
+    return points[:, :2]

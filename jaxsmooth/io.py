@@ -1,0 +1,152 @@
+"""Mesh files in and out."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import tempfile
+import uuid
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from jaxsmooth.exports import check_types, write_source
+from jaxsmooth.formats import MissingFileError, format_of_suffix, read_source, stem_format
+from jaxsmooth.meshfile import MeshFile, MeshFileError, from_meshio, to_meshio
+
+__all__ = ["MeshFileError", "MissingFileError", "check_output", "output_format", "read", "write"]
+
+
+def read(path: str | Path, *, dtype: Any = None) -> MeshFile:
+    """Read a mesh file, by its suffix and its first bytes.
+
+    All formats that meshio reads, and ``.npz`` archives with ``points`` and one array a cell type.
+
+    Args:
+        path: the file.
+        dtype: float32 or float64 for the points; by default the file's (as far as JAX allows it).
+
+    Returns:
+        The mesh with all that the file says about it; `MeshFile.notes` are worth showing.
+
+    Raises:
+        MeshFileError: a `ValueError` with one sentence that says what, where and what to do
+            (`MissingFileError`, also a `FileNotFoundError`, where the file isn't there).
+    """
+    path = Path(path)
+    source, name, notes = read_source(path)
+    try:
+        file = from_meshio(source, path=path, format=name, dtype=dtype)
+    except MeshFileError as error:
+        raise MeshFileError(f"{path}: {error}") from error
+    return dataclasses.replace(file, notes=(*notes, *file.notes))
+
+
+def write(
+    path: str | Path,
+    file: MeshFile,
+    points: Any = None,
+    *,
+    file_format: str | None = None,
+    force: bool = False,
+    cell_data: Mapping[str, Any] | None = None,
+    point_data: Mapping[str, Any] | None = None,
+) -> tuple[str, ...]:
+    """Write a file that was read, with other coordinates.
+
+    The output is complete or not there: it is written beside its target and renamed.
+
+    Args:
+        path: where to.  A name of the input's format keeps its version; others choose the format.
+        file: what was read; its data, sets and cells are written in their own order.
+        points: coordinates ``[nodes, dim]``, or what has them as ``.mesh.points`` (the result of
+            smoothing) or ``.points`` (a mesh); None for those of the file.
+        file_format: overrules the name: ``"gmsh"`` (4.1), ``"gmsh22"``, ``"vtk"``, ``"vtu"``, …, followed by
+            ``:ascii`` or ``:binary`` where the format has both.
+        force: allow the output to replace the input.
+        cell_data: more data of elements, ``{name: {type: [elements, …]}}``; see `to_meshio`.
+        point_data: more data of nodes ``{name: [nodes, …]}``.
+
+    Returns:
+        Notes: sentences on what the format can't hold.
+
+    Raises:
+        MeshFileError: the output is the input (without `force`), its folder is missing or can't be
+            written, or the format can't hold the mesh.
+    """
+    path = Path(path)
+    check_output(path, file.path, force, file_format)
+    name = output_format(path, file, file_format)
+    check_types(file.mesh.types, path, name)
+    for attribute in ("mesh", "points"):
+        points = getattr(points, attribute, points)
+    mesh = to_meshio(file, points, point_data=point_data, cell_data=cell_data)
+    # the suffix stays: some writers go by it
+    part = path.with_name(f".{path.stem}-{uuid.uuid4().hex[:8]}{''.join(path.suffixes[-1:])}")
+    try:
+        notes = write_source(part, mesh, name, file.mesh.dim)
+        os.replace(part, path)
+    except MeshFileError as error:
+        raise MeshFileError(str(error).replace(str(part), str(path))) from error
+    except OSError as error:
+        raise MeshFileError(f"{path}: the file can't be written ({error.strerror})") from error
+    finally:
+        part.unlink(missing_ok=True)
+    return tuple(notes)
+
+
+def check_output(
+    path: str | Path,
+    input_path: str | Path | None = None,
+    force: bool = False,
+    file_format: str | None = None,
+) -> None:
+    """Whether an output can be written, before any work is done for it.
+
+    Args:
+        path: the output.
+        input_path: the input, if there is one.
+        force: allow the two to be one file.
+        file_format: the format where the name doesn't say it.
+
+    Raises:
+        MeshFileError: no such folder, a folder that can't be written, a format that isn't known, or
+            the input without `force`.
+    """
+    path = Path(path)
+    folder = path.parent
+    if file_format is None:
+        format_of_suffix(path)
+    if not folder.is_dir():
+        raise MeshFileError(f"{path}: there is no folder {folder}; create it or write elsewhere")
+    if path.is_dir():
+        raise MeshFileError(f"{path}: this is a folder; give the name of a file")
+    if input_path is not None and not force and _same(path, Path(input_path)):
+        raise MeshFileError(f"{path}: this is the input; give another name, or --force to replace it")
+    try:  # permissions alone don't tell (read-only file systems, root)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise MeshFileError(f"{path}: the folder {folder} can't be written ({error.strerror})") from error
+
+
+def _same(path: Path, other: Path) -> bool:
+    try:
+        return path.samefile(other)
+    except OSError:  # one of them isn't there
+        return path.resolve() == other.resolve()
+
+
+def output_format(path: str | Path, file: MeshFile, file_format: str | None = None) -> str:
+    """The format of an output: the one asked for, else the input's if the name allows it, else the name's.
+
+    Raises `MeshFileError` for suffixes that stand for no format."""
+    path = Path(path)
+    if file_format is not None:
+        return file_format
+    name = format_of_suffix(path)
+    if file.format is not None:
+        old = stem_format(file.format)
+        suffix = {"gmsh22": "gmsh22", "gmsh": "gmsh22", "vtk42": "vtk", "avsucd": "abaqus"}.get(old, old)
+        if name == file.format or suffix == stem_format(name):
+            return file.format
+    return name
