@@ -116,7 +116,7 @@ def _set_up_jax(precision: str) -> None:
 
 def _smooth(options: argparse.Namespace) -> int:
     from jaxsmooth import report
-    from jaxsmooth.io import check_output, read, write
+    from jaxsmooth.io import check_output, check_types, output_format, read, write
 
     method = _method(options.method)
     check_output(options.output, options.input, force=options.force)
@@ -127,6 +127,7 @@ def _smooth(options: argparse.Namespace) -> int:
     clock = report.Clock()
     with clock("read"):
         file = read(options.input)
+    check_types(file.mesh.types, Path(options.output), output_format(options.output, file))
     report.print_file(console, file)
     with clock("constraints"):
         constraints = _constraints(file, options)
@@ -134,7 +135,8 @@ def _smooth(options: argparse.Namespace) -> int:
     with clock("smooth"):
         result = _run(file, method, options.steps, constraints, lambda row: report.print_step(console, row))
     with clock("write"):
-        write(options.output, file, result, force=options.force)
+        notes = write(options.output, file, result, force=options.force)
+    report.print_notes(console, notes)
     report.print_comparison(console, file.mesh, result)
     console.print(f"{result.status}; wrote {options.output} in {sum(clock.seconds.values()):.1f} s")
     if options.json:

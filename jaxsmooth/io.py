@@ -10,11 +10,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from jaxsmooth.exports import check_types, write_source
-from jaxsmooth.formats import MissingFileError, format_of_suffix, read_source, stem_format
+from jaxsmooth.files.exports import check_types, write_source
+from jaxsmooth.files.formats import MissingFileError, format_of_suffix, read_source, stem_format
 from jaxsmooth.meshfile import MeshFile, MeshFileError, from_meshio, to_meshio
 
-__all__ = ["MeshFileError", "MissingFileError", "check_output", "output_format", "read", "write"]
+__all__ = [
+    "MeshFileError",
+    "MissingFileError",
+    "check_output",
+    "check_types",
+    "output_format",
+    "read",
+    "write",
+]
 
 
 def read(path: str | Path, *, dtype: Any = None) -> MeshFile:
@@ -75,7 +83,7 @@ def write(
             written, or the format can't hold the mesh.
     """
     path = Path(path)
-    check_output(path, file.path, force, file_format)
+    check_output(path, file.path, force)
     name = output_format(path, file, file_format)
     check_types(file.mesh.types, path, name)
     for attribute in ("mesh", "points"):
@@ -95,28 +103,21 @@ def write(
     return tuple(notes)
 
 
-def check_output(
-    path: str | Path,
-    input_path: str | Path | None = None,
-    force: bool = False,
-    file_format: str | None = None,
-) -> None:
-    """Whether an output can be written, before any work is done for it.
+def check_output(path: str | Path, input_path: str | Path | None = None, force: bool = False) -> None:
+    """Whether an output (of any kind) can be written, before any work is done for it.
+
+    Whether its name stands for a mesh format is for `output_format` to say.
 
     Args:
         path: the output.
         input_path: the input, if there is one.
         force: allow the two to be one file.
-        file_format: the format where the name doesn't say it.
 
     Raises:
-        MeshFileError: no such folder, a folder that can't be written, a format that isn't known, or
-            the input without `force`.
+        MeshFileError: no such folder, a folder that can't be written, or the input without `force`.
     """
     path = Path(path)
     folder = path.parent
-    if file_format is None:
-        format_of_suffix(path)
     if not folder.is_dir():
         raise MeshFileError(f"{path}: there is no folder {folder}; create it or write elsewhere")
     if path.is_dir():

@@ -26,9 +26,9 @@ class Labels(eqx.Module):
         feature_tags: one int array ``[m]`` each: cells of different tags do not mix.
     """
 
-    regions: tuple[Int[np.ndarray, " elements"], ...]
-    features: tuple[Int[np.ndarray, "m k"], ...] = ()
-    feature_tags: tuple[Int[np.ndarray, " m"], ...] = ()
+    regions: tuple[Int[np.ndarray, "_"], ...]
+    features: tuple[Int[np.ndarray, "_ _"], ...] = ()
+    feature_tags: tuple[Int[np.ndarray, "_"], ...] = ()
     feature_types: tuple[str, ...] = eqx.field(static=True, default=())
 
 

@@ -16,7 +16,7 @@ import meshio
 import numpy as np
 
 from jaxsmooth.elements import element_type
-from jaxsmooth.filechecks import (
+from jaxsmooth.files.checks import (
     SYNONYMS,
     MeshFileError,
     check_cells,
@@ -25,7 +25,7 @@ from jaxsmooth.filechecks import (
     element_dim,
     in_plane,
 )
-from jaxsmooth.filelabels import held_nodes, make_labels, make_named_sets, plain
+from jaxsmooth.files.labels import held_nodes, make_labels, make_named_sets, plain
 from jaxsmooth.mesh import Mesh
 from jaxsmooth.orientation import orient
 

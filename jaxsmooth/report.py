@@ -195,7 +195,10 @@ def compare_row(
 
 def console(quiet: bool = False) -> Console:
     """Where people read: standard output; silent when `quiet`."""
-    return Console(quiet=quiet, highlight=False, soft_wrap=True)
+    out = Console(quiet=quiet, highlight=False, soft_wrap=True)
+    if not out.is_terminal:
+        out.width = 160
+    return out
 
 
 def print_file(out: Console, file: MeshFile) -> None:
@@ -203,8 +206,13 @@ def print_file(out: Console, file: MeshFile) -> None:
     sizes = counts(file.mesh)
     elements = ", ".join(f"{number:,} {name}" for name, number in sizes["elements"].items())
     out.print(f"{file.path}: {sizes['nodes']:,} nodes; {elements}")
-    for note in file.notes:
-        out.print(f"  note: {note}", style="yellow")
+    print_notes(out, file.notes)
+
+
+def print_notes(out: Console, notes: tuple[str, ...]) -> None:
+    """What the reader or the writer noticed."""
+    for note in notes:
+        out.print(f"  note: {note}", style="yellow", markup=False)
 
 
 def print_constraints(out: Console, constraints: Constraints) -> None:
@@ -261,7 +269,7 @@ def print_quality(out: Console, rows: list[dict[str, Any]]) -> None:
     """The table of ``quality``."""
     table = Table(box=None, pad_edge=False)
     for name in ("metric", "type", "elements", "min", "avg", "max", "std", "unacceptable"):
-        table.add_column(name, justify="left" if name in ("metric", "type") else "right")
+        table.add_column(name, justify="left" if name in ("metric", "type") else "right", no_wrap=True)
     for row in rows:
         numbers = [_number(row[name]) for name in ("min", "avg", "max", "std")]
         count, bad = f"{row['elements']:,}", f"{row['unacceptable']:,}"
@@ -280,7 +288,7 @@ def print_compare(out: Console, rows: list[dict[str, Any]]) -> None:
     table = Table(box=None, pad_edge=False)
     heads = ("method", "q_min", "q_avg", "q<0.2", "sj_min", "inverted", "|", "q_min", "q_avg", "q<0.2")
     for name in (*heads, "steps", "seconds", "compile"):
-        table.add_column(name, justify="left" if name == "method" else "right")
+        table.add_column(name, justify="left" if name == "method" else "right", no_wrap=True)
     for row in rows:
         whole, part = row["all"], row["movable"]
         cells = [_number(whole["q_min"]), _number(whole["q_avg"]), f"{whole['q_below_0.2']:,}"]

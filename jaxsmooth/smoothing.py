@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsmooth.constraints import Constraints, detect_constraints
@@ -19,6 +20,7 @@ from jaxsmooth.meshfile import as_mesh
 from jaxsmooth.methods import Elastic, Method
 from jaxsmooth.patches import Evaluation, evaluate
 from jaxsmooth.quality import quality
+from jaxsmooth.runs import run
 
 __all__ = ["SmoothResult", "Statistics", "Status", "StepRecord", "smooth", "statistics"]
 
@@ -142,6 +144,9 @@ def smooth(
         tolerance_min: see above.
         callback: called with every `StepRecord`, the input's first.
 
+    With points that JAX traces (under `jax.grad`, `jit` or `vmap`) all steps are made, as by `run`, and
+    the history is empty.
+
     Returns:
         The smoothed mesh with its history.  A valid mesh stays valid under every guarded method.
 
@@ -149,11 +154,12 @@ def smooth(
         ValueError: for an invalid mesh, or constraints that do not fit it.
     """
     mesh = as_mesh(mesh)
-    method = Elastic() if method is None else method
+    method = (Elastic() if method is None else method).prepare(mesh)
+    if isinstance(mesh.points, jax.core.Tracer):
+        return _smooth_traced(mesh, method, steps, constraints)
     constraints = detect_constraints(mesh) if constraints is None else constraints
     _check(mesh, constraints, steps)
     labels, mesh = mesh.labels, _bare(mesh)
-    method = method.prepare(mesh)
 
     history: list[StepRecord] = []
 
@@ -192,6 +198,21 @@ def smooth(
             status = Status.CONVERGED
             break
     return SmoothResult(mesh.with_labels(labels), evaluation.quality, tuple(history), status, constraints)
+
+
+def _smooth_traced(mesh: Mesh, method: Method, steps: int, constraints: Constraints | None) -> SmoothResult:
+    """`run`, with constraints found on the host while the compiled function waits."""
+    if constraints is None:
+        leaves, structure = jax.tree.flatten(mesh)
+
+        def detect(leaves: list[Any]) -> np.ndarray:
+            return np.asarray(detect_constraints(jax.tree.unflatten(structure, leaves)).projectors)
+
+        shape = jax.ShapeDtypeStruct((*mesh.points.shape, mesh.dim), mesh.points.dtype)
+        fixed = jax.lax.stop_gradient(leaves)
+        constraints = Constraints(jax.pure_callback(detect, shape, fixed, vmap_method="sequential"))
+    labels, mesh = mesh.labels, run(_bare(mesh), method, constraints=constraints, steps=steps)
+    return SmoothResult(mesh.with_labels(labels), evaluate(mesh).quality, (), Status.STEP_LIMIT, constraints)
 
 
 def _better(now: Statistics, before: Statistics) -> bool:

@@ -49,9 +49,8 @@ def find_facets(mesh: Mesh) -> list[Facets]:
         region = np.concatenate([p[1] for p in parts])
         found.append([kind, nodes, region])
     # A quadratic element may meet a linear one: corners decide, whatever the facet type.
-    keys = np.concatenate(
-        [facet_keys(nodes[:, : kind.corners], len(mesh.points)) for kind, nodes, _ in found]
-    )
+    corners = [_three_corners(nodes[:, : kind.corners]) for kind, nodes, _ in found]
+    keys = facet_keys(np.concatenate(corners), len(mesh.points))
     regions = np.concatenate([region for _, _, region in found])
     partner = _pair(keys, regions)
     ends = np.cumsum([len(nodes) for _, nodes, _ in found])
@@ -62,15 +61,17 @@ def find_facets(mesh: Mesh) -> list[Facets]:
 
 
 def facet_keys(corners: np.ndarray, count: int) -> np.ndarray:
-    """One integer for every set of corner nodes ``[facets, c]`` of a mesh of `count` nodes.
-
-    Three corners tell the faces of a solid apart, so the largest of a quadrilateral's is left out.
-    """
-    ordered = np.sort(corners, axis=1)[:, :3].astype(np.int64)
+    """One integer for every set of corner nodes ``[facets, c]`` of a mesh of `count` nodes."""
+    ordered = _three_corners(corners).astype(np.int64)
     if count < 2**21:
         base = np.int64(count)
         return ordered @ base ** np.arange(ordered.shape[1])[::-1]
     return np.unique(ordered, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _three_corners(corners: np.ndarray) -> np.ndarray:
+    """The lowest three, sorted: enough to tell the faces of a solid apart."""
+    return np.sort(corners, axis=1)[:, :3]
 
 
 def _pair(keys: np.ndarray, regions: np.ndarray) -> np.ndarray:

@@ -99,8 +99,8 @@ class RisingGuard(PatchGuard):
     halvings: int = eqx.field(static=True, default=0)
 
     def threshold(self, least: Float[Array, " nodes"]) -> Float[Array, " nodes"]:
-        """The next number above the least quality."""
-        return jnp.nextafter(least, jnp.inf)
+        """Above the least quality by more than rounding."""
+        return least + rounding(least)
 
 
 class SmartGuard(eqx.Module):
@@ -162,4 +162,12 @@ def gains(mesh: Mesh, move: Field, before: Evaluation, beta) -> Float[Array, " n
         turned = ~(jax.vmap(jax.vmap(partial(min_jacobian, kind)))(variants) > 0) & (det > 0)[:, None]
         after = after.at[nodes].min(jnp.where(turned, -jnp.inf, each), mode="promise_in_bounds")
     risen = after - patch_min(mesh, before.quality)
-    return jnp.where(risen > 0, risen, -jnp.inf)  # so written, NaN gains nothing
+    return jnp.where(risen > rounding(risen), risen, -jnp.inf)  # so written, NaN gains nothing
+
+
+def rounding(quality: Float[Array, " nodes"]) -> float:
+    """A difference of qualities, which are of order 1, that means nothing.
+
+    A mid-side node that slides along its straight side changes the quality by as much.
+    """
+    return 32 * float(jnp.finfo(quality.dtype).eps)

@@ -19,11 +19,11 @@ import meshio
 import numpy as np
 from meshio._helpers import extension_to_filetypes
 
-from jaxsmooth.abaqus import is_abaqus, read_abaqus
 from jaxsmooth.elements import TYPES, element_type
+from jaxsmooth.files.abaqus import is_abaqus, read_abaqus
+from jaxsmooth.files.msh import read_msh_data, repaired_msh, sniff_msh
+from jaxsmooth.files.su2 import name_markers
 from jaxsmooth.meshfile import MeshFileError
-from jaxsmooth.msh import read_msh_data, repaired_msh, sniff_msh
-from jaxsmooth.su2 import name_markers
 
 __all__ = [
     "EXODUS_BLOCKS",

@@ -9,10 +9,9 @@ from pathlib import Path
 import meshio
 import numpy as np
 
-from jaxsmooth.abaqus import write_abaqus
 from jaxsmooth.elements import supported
-from jaxsmooth.filelabels import REGION_NAMES, is_mask, plain
-from jaxsmooth.formats import (
+from jaxsmooth.files.abaqus import write_abaqus
+from jaxsmooth.files.formats import (
     EXODUS_BLOCKS,
     EXODUS_ORDER,
     MEDIT_SETS,
@@ -20,9 +19,10 @@ from jaxsmooth.formats import (
     quiet,
     stem_format,
 )
+from jaxsmooth.files.labels import REGION_NAMES, is_mask, plain
+from jaxsmooth.files.msh import split_by_entity, write_data_sections, write_msh41
+from jaxsmooth.files.su2 import write_su2
 from jaxsmooth.meshfile import MeshFileError
-from jaxsmooth.msh import split_by_entity, write_data_sections, write_msh41
-from jaxsmooth.su2 import write_su2
 
 __all__ = ["check_types", "write_source"]
 

@@ -1,0 +1,1 @@
+"""File formats: what meshio gets wrong or loses, put right around it."""

@@ -1,0 +1,200 @@
+"""The command line, run as its user runs it; most calls in this process, to share compiles."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+
+import meshio
+import numpy as np
+import pytest
+from meshes import grid
+
+import jaxsmooth as js
+from jaxsmooth.cli import main
+
+
+@pytest.fixture(scope="module")
+def part(tmp_path_factory):
+    """A small mesh file with point data, cell data and a named set."""
+    path = tmp_path_factory.mktemp("cli") / "part.vtu"
+    points, blocks = grid("tetra", (2, 2, 2), amplitude=0.1)
+    count = len(blocks["tetra"])
+    meshio.Mesh(
+        points,
+        list(blocks.items()),
+        point_data={"temperature": np.arange(len(points), dtype=float)},
+        cell_data={"material": [np.ones(count, dtype=np.int64)]},
+    ).write(path)
+    return path
+
+
+def run(*arguments):
+    return main([str(a) for a in arguments])
+
+
+def test_smooth_writes_everything_back(part, tmp_path, capsys):
+    out, numbers, report = tmp_path / "out.vtu", tmp_path / "out.json", tmp_path / "out.html"
+    assert run("smooth", part, out, "--steps", 2, "--json", numbers, "--report", report) == 0
+    old, new = meshio.read(part), meshio.read(out)
+    assert (old.cells_dict["tetra"] == new.cells_dict["tetra"]).all()
+    assert (old.point_data["temperature"] == new.point_data["temperature"]).all()
+    assert (old.cell_data["material"][0] == new.cell_data["material"][0]).all()
+    assert np.abs(old.points - new.points).max() > 1e-3
+    on_side = (old.points == 0) | (old.points == 1)
+    assert np.abs(new.points - old.points)[on_side].max() < 1e-12
+
+    text = capsys.readouterr().out
+    assert "step  2" in text
+    assert "q < 0.2" in text
+    content = json.loads(numbers.read_text())
+    assert content["method"] == "elastic"
+    assert content["precision"] == "float64"
+    assert content["elements"] == {"tetra": len(old.cells_dict["tetra"])}
+    assert content["status"] in ("converged", "step limit")
+    assert {"q_min", "q_avg", "q_below_0.2", "inverted", "scaled_jacobian_min"} <= content["steps"][0].keys()
+    assert content["steps"][-1]["q_avg"] > content["steps"][0]["q_avg"]
+    assert content["seconds"].keys() == {"read", "constraints", "compile", "smooth", "write"}
+    page = report.read_text()
+    assert "data:image/png;base64," in page
+    assert "movable after" in page
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out.html", "out.json", "out.vtu"]
+
+
+def test_fixed_boundary_and_quiet(part, tmp_path, capsys):
+    out = tmp_path / "out.vtu"
+    assert run("smooth", part, out, "--steps", 2, "--boundary", "fixed", "-q") == 0
+    assert capsys.readouterr().out == ""
+    old, new = meshio.read(part).points, meshio.read(out).points
+    outer = ((old == 0) | (old == 1)).any(axis=1)
+    assert (old[outer] == new[outer]).all()
+    assert (old[~outer] != new[~outer]).any()
+
+
+def test_fix_names_a_set(part, tmp_path, capsys):
+    mesh = meshio.read(part)
+    mesh.point_sets = {}
+    mesh.point_data["CLAMP"] = (mesh.points[:, 0] < 0.6).astype(np.int64)
+    source, out = tmp_path / "in.vtu", tmp_path / "out.vtu"
+    mesh.write(source)
+    assert run("smooth", source, out, "--steps", 1, "--fix", "CLAMP", "-q") == 0
+    held = mesh.points[:, 0] < 0.6
+    assert (meshio.read(out).points == mesh.points)[held].all()
+    assert run("smooth", source, out, "--fix", "CLAMPS") == 2
+    assert "did you mean CLAMP?" in capsys.readouterr().err
+
+
+def test_quality(part, tmp_path, capsys):
+    assert run("quality", part, "--metric", "shape", "--json", "-") == 0
+    content = json.loads(capsys.readouterr().out)
+    q = np.concatenate(js.quality(js.read(part).mesh))
+    (row,) = content["quality"]
+    np.testing.assert_allclose([row["min"], row["avg"]], [q.min(), q.mean()])
+    assert row["metric"] == "shape"
+    assert run("quality", part) == 0
+    assert "mean_ratio" in capsys.readouterr().out
+
+
+def test_compare(part, tmp_path, capsys):
+    numbers = tmp_path / "c.json"
+    assert (
+        run("compare", part, "--methods", "elastic,weighted-laplacian", "--steps", 2, "--json", numbers) == 0
+    )
+    rows = json.loads(numbers.read_text())["methods"]
+    assert [row["method"] for row in rows] == ["input", "elastic", "weighted-laplacian"]
+    assert rows[1]["all"]["q_avg"] > rows[0]["all"]["q_avg"]
+    assert "weighted-laplacian" in capsys.readouterr().out
+
+
+def test_inverted_elements_give_exit_code_3(tmp_path, capsys):
+    points = np.array([[0, 0], [2, 0], [1, 1.0], [1, -1]])
+    meshio.Mesh(np.c_[points, np.zeros(4)], [("triangle", [[0, 1, 2], [0, 1, 3], [1, 2, 3]])]).write(
+        tmp_path / "in.vtk"
+    )
+    assert run("quality", tmp_path / "in.vtk") == 3
+    assert run("smooth", tmp_path / "in.vtk", tmp_path / "out.vtk", "--steps", 0) == 3
+    assert (tmp_path / "out.vtk").exists()
+
+
+BAD = [
+    (("smooth", "nowhere.vtu", "OUT"), "nowhere.vtu"),
+    (("smooth", "PART", "nofolder/out.vtu"), "nofolder"),
+    (("smooth", "PART", "PART"), "--force"),
+    (("smooth", "PART", "out.what"), ".what"),
+    (("smooth", "PART", "OUT", "--method", "elastc"), "did you mean elastic"),
+    (("smooth", "PART", "OUT", "--fix", "nothing"), "nothing"),
+    (("smooth", "PART", "OUT", "--steps", "-1"), "steps"),
+    (("smooth", "PART", "OUT", "--json", "nofolder/x.json"), "nofolder"),
+    (("quality", "PART", "--metric", "mean_ration"), "did you mean mean_ratio"),
+    (("compare", "PART", "--methods", "elastic,laplaciun"), "did you mean laplacian"),
+]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"), BAD, ids=lambda x: None if isinstance(x, str) else " ".join(x)
+)
+def test_bad_input_is_one_sentence(arguments, expected, part, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    before = part.read_bytes()
+    names = {"PART": str(part), "OUT": str(tmp_path / "out.vtu")}
+    assert run(*(names.get(a, a) for a in arguments)) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("jaxsmooth: ")
+    assert error.count("\n") == 1
+    assert expected in error
+    assert list(tmp_path.iterdir()) == []
+    assert part.read_bytes() == before
+
+
+BROKEN = {
+    "nan": (lambda p, c: (np.where(np.arange(len(p))[:, None] == 3, np.nan, p), c), "node 3"),
+    "range": (lambda p, c: (p, np.where(c == 5, 99, c)), "99"),
+    "twice": (lambda p, c: (p, np.c_[c[:, :3], c[:, 2]]), "twice"),
+}
+
+
+@pytest.mark.parametrize("fault", BROKEN)
+def test_broken_meshes(fault, tmp_path, capsys):
+    points, blocks = grid("tetra", (1, 1, 1))
+    change, expected = BROKEN[fault]
+    points, nodes = change(points, blocks["tetra"])
+    np.savez(tmp_path / "in.npz", points=points, tetra=nodes)
+    assert run("smooth", tmp_path / "in.npz", tmp_path / "out.npz") == 2
+    assert expected in capsys.readouterr().err
+    assert not (tmp_path / "out.npz").exists()
+
+
+def test_help_does_not_load_jax():
+    code = "import sys, jaxsmooth.cli as c\ntry: c.main(['smooth', '--help'])\nexcept SystemExit: pass\n"
+    code += "assert 'jax' not in sys.modules and 'numpy' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+    times = []
+    for _ in range(3):
+        start = time.perf_counter()
+        subprocess.run([sys.executable, "-m", "jaxsmooth", "--help"], check=True, stdout=subprocess.DEVNULL)
+        times.append(time.perf_counter() - start)
+    assert min(times) < 3.0  # 0.06 s on an idle machine; the bound only catches an import of JAX
+
+
+def test_the_help_names_every_method():
+    from jaxsmooth.cli import _METHODS
+    from jaxsmooth.methods import METHODS
+
+    assert _METHODS.split(", ") == list(METHODS)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_is_read_only(part, tmp_path, capsys):
+    tmp_path.chmod(0o500)
+    assert run("smooth", part, tmp_path / "out.vtu") == 2
+    assert "out.vtu" in capsys.readouterr().err
+
+
+def test_demo(tmp_path, capsys):
+    assert run("demo", tmp_path / "demo") == 0
+    names = {p.name for p in (tmp_path / "demo").iterdir()}
+    assert names == {"bracket-smooth.vtu", "before-after.png", "report.html"}
+    q = np.concatenate(js.quality(js.read(tmp_path / "demo" / "bracket-smooth.vtu").mesh))
+    assert (q < 0.2).sum() < 30  # 309 before
+    assert "scaled Jacobian" in capsys.readouterr().out
