@@ -47,6 +47,9 @@ def _rotation_jvp(primals: tuple[Matrix], tangents: tuple[Matrix]) -> tuple[Matr
     """
     (moments,), (change,) = primals, tangents
     r = rotation(moments)
+    size = jnp.abs(moments).max()
+    size = jax.lax.stop_gradient(jnp.where(size > 0, size, 1))
+    moments, change = moments / size, change / size
     s, d = r @ moments, r @ change
     floor = 8 * jnp.finfo(moments.dtype).eps
     skew = d - d.T
@@ -64,6 +67,7 @@ def _rotation_jvp(primals: tuple[Matrix], tangents: tuple[Matrix]) -> tuple[Matr
 
 
 def _rotation_2d(h: Matrix) -> Matrix:
+    h = _scaled(h)
     cosine, sine = h[0, 0] + h[1, 1], h[0, 1] - h[1, 0]
     length = norm(jnp.stack([cosine, sine]))
     regular = length > 0
@@ -72,10 +76,15 @@ def _rotation_2d(h: Matrix) -> Matrix:
     return jnp.stack([jnp.stack([cosine, -sine]), jnp.stack([sine, cosine])])
 
 
+def _scaled(h: Matrix) -> Matrix:
+    """h over its largest entry: squares of what is left neither over- nor underflow."""
+    size = jnp.abs(h).max()
+    return h / jnp.where(size > 0, size, 1)
+
+
 def _rotation_3d(h: Matrix) -> Matrix:
     tiny = jnp.finfo(h.dtype).tiny
-    size = jnp.abs(h).max()
-    h = h / jnp.where(size > 0, size, 1)
+    h = _scaled(h)
 
     # Columns as tuples of scalars: under vmap everything stays elementwise and fuses.
     def dot(a, b):

@@ -66,15 +66,17 @@ class Guarded(NamedTuple):
 class PatchGuard(eqx.Module):
     """Eq. 34 in a form that does not depend on node numbering.
 
-    All nodes move; where an element ends below γ times the least quality that the patch of one
-    of its moving nodes had, or turns inverted, the moves of its nodes are halved, and after
-    `halvings` times taken back; until no element offends.  It ends, because nodes that do not
-    move offend nobody: that is the old mesh.  A patch that was inverted may not get worse.
+    All nodes move; where a patch ends below γ times its least quality, the move of its node is
+    halved, and after `halvings` times taken back; so are those of all nodes of an element that
+    turns inverted; until no patch offends.  It ends, because nodes that do not move offend
+    nobody: that is the old mesh.  Beyond Eq. 34, a patch may not fall below `poor`, and one that
+    is below may not get worse.
 
     The accepted fractions of the moves are constants for differentiation.
 
     Attributes:
         gamma: γ of Eq. 34.
+        poor: quality below which no patch may fall or worsen; 0 is Eq. 34 alone.
         halvings: how often a move is halved before it is taken back.
     """
 

@@ -56,8 +56,8 @@ def conjugate_gradients(
     matvec: Callable[[Field], Field],
     right: Field,
     precondition: Callable[[Field], Field],
-    tolerance: float,
-    max_iterations: int,
+    tolerance: Float[Array, ""] | float,
+    max_iterations: Int[Array, ""] | int,
 ) -> Solution:
     """Preconditioned CG until the *true* residual is below `tolerance` times ``|b|``.
 

@@ -36,9 +36,8 @@ def find_facets(mesh: Mesh) -> list[Facets]:
     ``partner == -1``.
     """
     owners: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
-    for index, (kind, nodes) in enumerate(mesh.blocks):
+    for (kind, nodes), region in zip(mesh.blocks, _regions(mesh), strict=True):
         nodes = np.asarray(nodes)
-        region = _regions(mesh, index)
         for group in kind.facets:
             sides = nodes[:, group.nodes].reshape(-1, group.nodes.shape[1])
             owners.setdefault(group.type.name, []).append((sides, np.repeat(region, len(group.nodes))))
@@ -84,11 +83,14 @@ def _pair(keys: np.ndarray, regions: np.ndarray) -> np.ndarray:
     return partner
 
 
-def _regions(mesh: Mesh, index: int) -> np.ndarray:
+def _regions(mesh: Mesh) -> list[np.ndarray]:
+    """Regions of the elements of each block, numbered from 0; one region without labels."""
+    sizes = [len(nodes) for nodes in mesh.connectivity]
     if mesh.labels is None or not mesh.labels.regions:
-        return np.zeros(len(mesh.connectivity[index]), dtype=np.int64)
-    regions = np.asarray(mesh.labels.regions[index], dtype=np.int64)
-    return regions - regions.min(initial=0)
+        return [np.zeros(size, dtype=np.int64) for size in sizes]
+    tags = np.concatenate([np.asarray(part) for part in mesh.labels.regions])
+    numbers = np.unique(tags, return_inverse=True)[1].reshape(-1)
+    return np.split(numbers, np.cumsum(sizes)[:-1])
 
 
 def node_pairs(mesh: Mesh) -> np.ndarray:
