@@ -1,0 +1,1 @@
+"""The paper's six examples and eight tables: `python -m benchmarks.paper`."""
