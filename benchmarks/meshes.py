@@ -64,7 +64,7 @@ def smooth_file(path: Path, name: str, steps: int) -> str:
     """One row of the table.  Raises `ValueError` where a promise is broken."""
     from jaxsmooth.io import read, write
     from jaxsmooth.methods import METHODS
-    from jaxsmooth.quality import quality
+    from jaxsmooth.metrics import quality
     from jaxsmooth.smoothing import smooth
 
     file = read(path)

@@ -24,7 +24,7 @@ _HOMES = {
     "meshfile": ("MeshFile", "from_meshio"),
     "methods": ("METHODS", "Elastic", "Laplacian", "Method"),
     "patches": ("PatchGuard",),
-    "quality": ("METRICS", "quality", "quality_mean"),
+    "metrics": ("METRICS", "quality", "quality_mean"),
     "runs": ("FixedPoint", "fixed_point", "run", "step"),
     "smoothing": ("SmoothResult", "Status", "smooth", "statistics"),
 }
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from jaxsmooth.mesh import Labels, Mesh
     from jaxsmooth.meshfile import MeshFile, from_meshio
     from jaxsmooth.methods import METHODS, Elastic, Laplacian, Method
+    from jaxsmooth.metrics import METRICS, quality, quality_mean
     from jaxsmooth.patches import PatchGuard
-    from jaxsmooth.quality import METRICS, quality, quality_mean
     from jaxsmooth.runs import FixedPoint, fixed_point, run, step
     from jaxsmooth.smoothing import SmoothResult, Status, smooth, statistics
 

@@ -150,7 +150,7 @@ def _smooth(options: argparse.Namespace) -> int:
 def _quality(options: argparse.Namespace) -> int:
     from jaxsmooth import report
     from jaxsmooth.io import check_output, read
-    from jaxsmooth.quality import METRICS, metric
+    from jaxsmooth.metrics import METRICS, metric
 
     names = options.metric or list(METRICS)
     for name in names:

@@ -12,7 +12,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float, Int
 
 from jaxsmooth.mesh import Mesh, gather
-from jaxsmooth.quality import min_jacobian, shape_quality
+from jaxsmooth.metrics import min_jacobian, shape_quality
 
 __all__ = ["Evaluation", "Guarded", "PatchGuard", "evaluate", "patch_mean", "patch_min"]
 

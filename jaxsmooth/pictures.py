@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxsmooth.elements import ElementType
 from jaxsmooth.mesh import Mesh
-from jaxsmooth.quality import quality
+from jaxsmooth.metrics import quality
 from jaxsmooth.topology import find_facets
 
 try:

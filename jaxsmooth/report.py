@@ -21,7 +21,7 @@ from rich.table import Table
 from jaxsmooth.constraints import Constraints
 from jaxsmooth.mesh import Mesh
 from jaxsmooth.meshfile import MeshFile
-from jaxsmooth.quality import METRICS, quality
+from jaxsmooth.metrics import METRICS, quality
 from jaxsmooth.smoothing import SmoothResult, StepRecord
 
 __all__ = [

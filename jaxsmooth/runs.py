@@ -51,7 +51,7 @@ def run(mesh: Mesh, method: Method | None = None, *, constraints: Constraints, s
     Returns:
         The smoothed mesh.
     """
-    method = Elastic() if method is None else method
+    method = _prepared(method, mesh)
     saved = jax.checkpoint_policies.save_only_these_names("displacement", "accepted")
 
     def advance(points: Field, index: Int[Array, ""]) -> tuple[Field, None]:
@@ -71,6 +71,13 @@ def run(mesh: Mesh, method: Method | None = None, *, constraints: Constraints, s
         return mesh.with_points(several(mesh.points, jnp.arange(steps))[0])
     indices = jnp.arange(outer * inner).reshape(outer, inner)
     return mesh.with_points(jax.lax.scan(jax.checkpoint(several), mesh.points, indices)[0])
+
+
+def _prepared(method: Method | None, mesh: Mesh) -> Method:
+    """The method with its host-side work done, where the connectivity is known on the host."""
+    method = Elastic() if method is None else method
+    traced = any(isinstance(nodes, jax.core.Tracer) for nodes in mesh.connectivity)
+    return method if traced else method.prepare(mesh)
 
 
 class FixedPoint(eqx.Module):
@@ -112,7 +119,7 @@ def fixed_point(
     Returns:
         The mesh, the number of steps and the last change: compare it with `tolerance`.
     """
-    method = Elastic() if method is None else method
+    method = _prepared(method, mesh)
     method = eqx.tree_at(lambda m: m.guard, method, None, is_leaf=lambda x: x is None)
     stopped = jax.lax.stop_gradient
     points, projectors = mesh.points, constraints.projectors

@@ -18,8 +18,8 @@ from jaxsmooth.constraints import Constraints, detect_constraints
 from jaxsmooth.mesh import Mesh
 from jaxsmooth.meshfile import as_mesh
 from jaxsmooth.methods import Elastic, Method
+from jaxsmooth.metrics import quality
 from jaxsmooth.patches import Evaluation, evaluate
-from jaxsmooth.quality import quality
 from jaxsmooth.runs import run
 
 __all__ = ["SmoothResult", "Statistics", "Status", "StepRecord", "smooth", "statistics"]

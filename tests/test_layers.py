@@ -11,7 +11,7 @@ ORDER = [
     ("topology",),
     ("orientation", "files.checks", "files.labels"),
     ("meshfile",),
-    ("quality", "constraints", "fitting", "elasticity"),
+    ("metrics", "constraints", "fitting", "elasticity"),
     ("patches", "solve"),
     ("objective", "minimise"),
     ("methods",),

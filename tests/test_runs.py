@@ -12,8 +12,8 @@ import jaxsmooth as js
 from jaxsmooth.elasticity import Material, element_force, linearise
 from jaxsmooth.elements import element_type
 from jaxsmooth.fitting import target_element
+from jaxsmooth.metrics import measure, shape_quality
 from jaxsmooth.patches import evaluate
-from jaxsmooth.quality import measure, shape_quality
 
 SHARED = Path(__file__).parents[2] / "shared" / "meshes"
 EXACT = 1e-13  # of the linear systems, where differences are taken
@@ -80,7 +80,6 @@ def test_one_step_of_every_type(kind):
 )
 def test_runs(square, method, steps):
     mesh, constraints, weights, direction = square
-    method = method.prepare(mesh)
 
     def function(p):
         return objective(js.run(mesh.with_points(p), method, constraints=constraints, steps=steps), weights)

@@ -13,7 +13,7 @@ from benchmarks.paper.examples import Outcome
 from benchmarks.paper.printed import COMPARISON, ELEMENTS, EVOLUTION, METRIC_ROWS, SHAPES
 from jaxsmooth.elements import element_type
 from jaxsmooth.mesh import Mesh
-from jaxsmooth.quality import quality
+from jaxsmooth.metrics import quality
 
 __all__ = ["Table", "comparison", "evolution", "metrics", "timing", "write_csv"]
 

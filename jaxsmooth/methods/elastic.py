@@ -14,8 +14,8 @@ from jaxsmooth.elasticity import ElementBlock, Material, Operator, element_force
 from jaxsmooth.fitting import target_element
 from jaxsmooth.mesh import Mesh, gather, scatter_add
 from jaxsmooth.methods.base import Method, Proposal
+from jaxsmooth.metrics import measure, shape_quality
 from jaxsmooth.patches import Evaluation, PatchGuard, patch_mean
-from jaxsmooth.quality import measure, shape_quality
 from jaxsmooth.solve import solve_projected
 
 __all__ = ["Elastic"]

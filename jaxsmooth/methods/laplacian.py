@@ -14,8 +14,8 @@ from jaxsmooth.constraints import Constraints
 from jaxsmooth.elements import ElementType
 from jaxsmooth.mesh import Mesh, gather, scatter_add
 from jaxsmooth.methods.base import Method, Proposal
+from jaxsmooth.metrics import min_jacobian, shape_quality
 from jaxsmooth.patches import Evaluation, Guarded, PatchGuard, patch_min
-from jaxsmooth.quality import min_jacobian, shape_quality
 from jaxsmooth.small import contract, determinant
 from jaxsmooth.topology import node_pairs
 

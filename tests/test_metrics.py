@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 
 from jaxsmooth.elements import element_type
 from jaxsmooth.mesh import Mesh
-from jaxsmooth.quality import METRICS, metric, quality, quality_mean, surface
+from jaxsmooth.metrics import METRICS, metric, quality, quality_mean, surface
 
 KINDS = meshes.KINDS
 TABLE = json.loads((Path(__file__).parent / "data" / "quality_tables.json").read_text())["elements"]
