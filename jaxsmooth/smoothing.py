@@ -182,20 +182,18 @@ def smooth(
         still = bool((step.points == mesh.points).all())
         moved = mesh.with_points(step.points)
         previous, current = current, statistics(moved, step.evaluation)
+        settled = (
+            abs(current.q_avg - previous.q_avg) < tolerance_avg
+            and abs(current.q_min - previous.q_min) < tolerance_min
+        )
         if method.guard is not None and not still and not _better(current, previous):
-            status = Status.NO_GAIN
+            status = Status.CONVERGED if settled else Status.NO_GAIN
             break
         mesh, evaluation = moved, step.evaluation
         counts = int(step.iterations), float(step.residual), int(step.shortened)
         record(StepRecord(index, current, *counts, time.perf_counter() - start))
-        if still:
-            status = Status.STALLED if counts[2] else Status.CONVERGED
-            break
-        if (
-            abs(current.q_avg - previous.q_avg) < tolerance_avg
-            and abs(current.q_min - previous.q_min) < tolerance_min
-        ):
-            status = Status.CONVERGED
+        if still or settled:
+            status = Status.STALLED if still and counts[2] else Status.CONVERGED
             break
     return SmoothResult(mesh.with_labels(labels), evaluation.quality, tuple(history), status, constraints)
 
