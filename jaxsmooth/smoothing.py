@@ -138,7 +138,8 @@ def smooth(
         mesh: a `Mesh`, a `MeshFile`, a `meshio.Mesh`, or ``(points, {"tetra": connectivity})``.
         method: how a step is made; `Elastic()`, the paper's standard method, by default.
         steps: the largest number of steps.
-        constraints: how nodes may move; `detect_constraints(mesh)` by default.
+        constraints: how nodes may move; by default `detect_constraints(mesh)`, with the nodes that
+            a `MeshFile` marks as `fixed` held.
         tolerance_avg: the run has converged when a step changes the average quality by less than
             this and the least quality by less than `tolerance_min`.  0 runs all steps.
         tolerance_min: see above.
@@ -153,11 +154,12 @@ def smooth(
     Raises:
         ValueError: for an invalid mesh, or constraints that do not fit it.
     """
+    fixed = getattr(mesh, "fixed", None)  # a file may name nodes to hold
     mesh = as_mesh(mesh)
     method = (Elastic() if method is None else method).prepare(mesh)
     if isinstance(mesh.points, jax.core.Tracer):
         return _smooth_traced(mesh, method, steps, constraints)
-    constraints = detect_constraints(mesh) if constraints is None else constraints
+    constraints = detect_constraints(mesh, fixed=fixed) if constraints is None else constraints
     _check(mesh, constraints, steps)
     labels, mesh = mesh.labels, _bare(mesh)
 

@@ -72,7 +72,7 @@ def test_a_step_that_makes_nothing_better_is_refused(square):
     mesh = js.Mesh(perfect, blocks)
     inside = js.detect_constraints(mesh).freedom == 2
     move = 0.01 * np.random.default_rng(0).normal(size=perfect.shape) * inside[:, None]
-    result = js.smooth(mesh, Mover(js.PatchGuard(gamma=0.1), jnp.asarray(move)))
+    result = js.smooth(mesh, Mover(js.PatchGuard(gamma=0.1), jnp.asarray(move)), tolerance_avg=0)
     assert result.status == js.Status.NO_GAIN
     assert (result.mesh.points == mesh.points).all()
     assert len(result.history) == 1
@@ -113,6 +113,15 @@ def test_labels_survive_and_interfaces_are_kept():
     assert (result.mesh.labels.regions[0] == mesh.labels.regions[0]).all()
     np.testing.assert_allclose(np.asarray(result.mesh.points)[middle, 0], 0.5, atol=1e-14)
     assert np.abs(np.asarray(result.mesh.points)[middle, 1] - points[middle, 1]).max() > 1e-4
+
+
+def test_fixed_nodes_of_a_file_are_held(square):
+    points = np.asarray(square.points)
+    cells = [(n, np.asarray(c)) for n, c in zip(square.types, square.connectivity, strict=True)]
+    mask = (points[:, 0] < 0.5).astype(np.int64)
+    file = js.from_meshio(meshio.Mesh(points, cells, point_data={"fixed": mask}))
+    moved = np.abs(np.asarray(js.smooth(file, steps=1).mesh.points) - points).max(axis=1)
+    assert moved[mask == 1].max() == 0 < moved[mask == 0].max()
 
 
 def test_constraints_of_another_mesh(square):
