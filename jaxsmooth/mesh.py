@@ -109,11 +109,21 @@ def _as_points(points: Any) -> Float[Array, "nodes dim"]:
             f"node {node} has a coordinate that is not finite ({array[node].tolist()}); "
             f"{int((~finite).sum())} such nodes in all; repair or remove them"
         )
-    if isinstance(points, jax.Array) and array.dtype.kind == "f":
-        return points
-    # jnp.asarray rejects the big-endian arrays that some readers return
-    dtype = np.float32 if array.dtype.itemsize <= 4 and array.dtype.kind == "f" else np.float64
-    return jnp.asarray(array.astype(dtype))
+    if not (isinstance(points, jax.Array) and array.dtype.kind == "f"):
+        # jnp.asarray rejects the big-endian arrays that some readers return
+        dtype = np.float32 if array.dtype.itemsize <= 4 and array.dtype.kind == "f" else np.float64
+        points = jnp.asarray(array.astype(dtype, copy=False))
+    _check_size(array, np.finfo(points.dtype))
+    return points
+
+
+def _check_size(points: np.ndarray, numbers: np.finfo) -> None:
+    """Fourth powers of lengths must neither over- nor underflow (the metric of a solid has them)."""
+    size = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    if size and not float(numbers.tiny) ** 0.2 < size < float(numbers.max) ** 0.25 / 10:
+        raise ValueError(
+            f"the mesh has a size of {size:.0e}, which {numbers.dtype} can't compute with; choose other units"
+        )
 
 
 def _check_block(index: int, name: str, nodes: np.ndarray, points_shape: tuple[int, ...]) -> None:
@@ -129,6 +139,8 @@ def _check_block(index: int, name: str, nodes: np.ndarray, points_shape: tuple[i
             f"{where}: connectivity must be integers of shape [elements, {kind.k}], "
             f"got {nodes.dtype} {list(nodes.shape)}"
         )
+    if len(nodes) == 0:
+        raise ValueError(f"{where} has no elements; leave it out")
     outside = (nodes < 0) | (nodes >= points_shape[0])
     if outside.any():
         element, column = np.argwhere(outside)[0]

@@ -146,3 +146,34 @@ def test_gradient_through_smooth(square):
         lambda p: js.quality_mean(js.run(square.with_points(p), constraints=constraints, steps=2))
     )
     np.testing.assert_allclose(run(square.points), pure(square.points), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("points", "blocks", "sentence"),
+    [
+        ([[0, 0], [1, 0], [0, 1]], {"triangle": np.zeros((0, 3), int)}, "block 0 .triangle. has no elements"),
+        ([[0, 0], [1e200, 0], [0, 1e200]], {"triangle": [[0, 1, 2]]}, "size of 1e[+]200"),
+        ([[0, 0], [1e-200, 0], [0, 1e-200]], {"triangle": [[0, 1, 2]]}, "size of 1e-200"),
+        ([[0, 0], [1, 0], [0, 1]], {"triangle": [[0, 1, 3]]}, "element 0: node index 3 is out of range"),
+        ([[0, 0], [1, 0], [0, 1]], {"triangle": [[0, 1, 1]]}, "element 0: node 1 appears twice"),
+        (
+            [[0, 0], [np.nan, 0], [0, 1]],
+            {"triangle": [[0, 1, 2]]},
+            "node 1 has a coordinate that is not finite",
+        ),
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 1]], {"triangle": [[0, 1, 2]]}, "surface elements in 3D"),
+        ([[0, 0], [1, 0], [0, 1]], {"polygon": [[0, 1, 2]]}, "'polygon' is not supported"),
+        ([[0, 0], [1, 0], [0, 1]], {}, "no element blocks"),
+    ],
+)
+def test_meshes_that_are_refused(points, blocks, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        js.Mesh(np.array(points, float), blocks)
+
+
+@pytest.mark.parametrize("factor", [0.0, 1.0])
+def test_flat_and_collapsed_meshes_do_not_give_nan(factor):
+    points = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * [factor, 0]
+    result = js.smooth((points, {"triangle": [[0, 1, 2], [1, 3, 2]]}), steps=2)
+    assert np.isfinite(np.asarray(result.mesh.points)).all()
+    assert result.history[-1].statistics.inverted == 2
