@@ -28,7 +28,7 @@ _SAFETY = 4.0  # noise of a direction, in units of coordinate error over length
 class Constraints(eqx.Module):
     """Attributes: orthogonal projectors ``[nodes, dim, dim]`` onto the free directions."""
 
-    projectors: Float[Array, "nodes dim dim"]
+    projectors: Float[Array, "*batch nodes dim dim"]
 
     @property
     def freedom(self) -> np.ndarray:
