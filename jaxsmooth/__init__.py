@@ -22,7 +22,7 @@ _HOMES = {
     "io": ("read", "write"),
     "mesh": ("Labels", "Mesh"),
     "meshfile": ("MeshFile", "from_meshio"),
-    "methods": ("METHODS", "Elastic", "Laplacian", "Method"),
+    "methods": ("METHODS", "Elastic", "Laplacian", "Method", "Optimize"),
     "patches": ("PatchGuard",),
     "metrics": ("METRICS", "quality", "quality_mean"),
     "runs": ("FixedPoint", "fixed_point", "run", "step"),
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from jaxsmooth.io import read, write
     from jaxsmooth.mesh import Labels, Mesh
     from jaxsmooth.meshfile import MeshFile, from_meshio
-    from jaxsmooth.methods import METHODS, Elastic, Laplacian, Method
+    from jaxsmooth.methods import METHODS, Elastic, Laplacian, Method, Optimize
     from jaxsmooth.metrics import METRICS, quality, quality_mean
     from jaxsmooth.patches import PatchGuard
     from jaxsmooth.runs import FixedPoint, fixed_point, run, step

@@ -12,7 +12,7 @@ ORDER = [
     ("orientation", "files.checks", "files.labels"),
     ("meshfile",),
     ("metrics", "constraints", "fitting", "elasticity"),
-    ("patches", "solve"),
+    ("patches", "solve", "distortion"),
     ("objective", "minimise"),
     ("methods",),
     ("runs", "smoothing", "batch"),

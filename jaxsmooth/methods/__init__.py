@@ -6,8 +6,9 @@ from functools import partial
 from jaxsmooth.methods.base import Method, Proposal, Step
 from jaxsmooth.methods.elastic import Elastic
 from jaxsmooth.methods.laplacian import Laplacian
+from jaxsmooth.methods.optimize import Optimize
 
-__all__ = ["METHODS", "Elastic", "Laplacian", "Method", "Proposal", "Step"]
+__all__ = ["METHODS", "Elastic", "Laplacian", "Method", "Optimize", "Proposal", "Step"]
 
 METHODS: dict[str, Callable[[], Method]] = {
     "elastic": Elastic,
@@ -16,4 +17,5 @@ METHODS: dict[str, Callable[[], Method]] = {
     "smart-laplacian": partial(Laplacian, smart=True),
     "weighted-laplacian": partial(Laplacian, weighted=True),
     "smart-weighted-laplacian": partial(Laplacian, smart=True, weighted=True),
+    "optimize": Optimize,
 }

@@ -1,0 +1,147 @@
+"""The optimisation variant: shape quality maximised directly, within the same constraints."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsmooth.constraints import Constraints
+from jaxsmooth.distortion import METRICS
+from jaxsmooth.mesh import Mesh
+from jaxsmooth.methods.base import Method, Proposal
+from jaxsmooth.methods.elastic import Elastic, target_measures
+from jaxsmooth.minimise import Minimised, Minimiser, Newton
+from jaxsmooth.objective import Aggregation, Problem, problem
+from jaxsmooth.patches import Evaluation, PatchGuard
+
+__all__ = ["GOALS", "Optimize", "Stage"]
+
+TARGETS = ("free size", "own size", "given size")
+
+
+class Stage(NamedTuple):
+    """One minimisation: weights of the average and of the worst elements, and the power of the latter.
+
+    `tangled` stages are left out when the mesh is valid.
+    """
+
+    average: float
+    worst: float
+    power: float
+    tangled: bool = False
+
+
+_UNTANGLE = Stage(0, 1, 2, True)  # unlike the mean of 1 − q, it grows without bound towards inversion
+# What a user wants, as minimisations one after another (see `Aggregation`).
+GOALS: dict[str, tuple[Stage, ...]] = {
+    # the mean of 1 − q, with a light hand on the worst elements
+    "average": (_UNTANGLE, Stage(1, 0.1, 4)),
+    # a p-norm of 1/q that comes ever closer to the maximum
+    "worst": (_UNTANGLE, Stage(0, 1, 4), Stage(0, 1, 8), Stage(0, 1, 16)),
+    # the mean of 1 − q, and a penalty on what is worse than the pivot
+    "balanced": (_UNTANGLE, Stage(1, 1, 4), Stage(1, 1, 12)),
+}
+
+
+class Optimize(Method):
+    """Maximise the quality of all elements, starting from the elastic method's mesh.
+
+    Attributes:
+        goal: ``"average"``, ``"worst"`` or ``"balanced"``: the best mean quality, the best of
+            the poor elements, or both; see `GOALS`.
+        metric: ``"shape"``, the paper's q where its optimum is the ideal element and the mean
+            ratio elsewhere, or ``"mean_ratio"`` for all.
+        target: ``"free size"``, ``"own size"`` (the paper's) or ``"given size"``.
+        size: for a given size, the measure of the target elements: a number, or one array a block.
+        size_weight: how much the size counts beside the shape, unless it is free.
+        pivot: of n elements, ``pivot · √n`` count as poor: the value of the next is the pivot of
+            the aggregation.
+        minimiser: how the objective is reduced.
+        start: the method that makes the first steps, or None.
+        start_steps: their number.
+        untangling_steps: their number while elements are inverted.
+        guard: refuses moves that invert an element.
+
+    A step is the whole optimisation.  It is not differentiable in reverse mode.
+    """
+
+    goal: str = eqx.field(static=True, default="balanced")
+    metric: str = eqx.field(static=True, default="shape")
+    target: str = eqx.field(static=True, default="free size")
+    size: tuple[Float[Array, " elements"], ...] | Float[Array, ""] | float | None = None
+    size_weight: Float[Array, ""] | float = 1.0
+    pivot: Float[Array, ""] | float = 0.5
+    minimiser: Minimiser = Newton()
+    start: Method | None = Elastic()
+    start_steps: int = 2
+    untangling_steps: int = 10
+    guard: PatchGuard | None = PatchGuard(gamma=0.0, poor=0.0)
+
+    def __check_init__(self):
+        for name, known in (("goal", GOALS), ("metric", METRICS), ("target", TARGETS)):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
+        if (self.target == "given size") != (self.size is not None):
+            raise ValueError("size goes with target='given size', and only with it")
+
+    def propose(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Proposal:
+        """The displacement to the optimised mesh."""
+        mesh, constraints = jax.lax.stop_gradient((mesh, constraints))
+        points = self._begin(mesh, constraints, before)
+        sizes = self._sizes(mesh)
+        stages = jax.tree.map(lambda *values: jnp.stack([jnp.asarray(v) for v in values]), *GOALS[self.goal])
+
+        def run(carry, stage):
+            points, count = carry
+            aggregation = Aggregation(*(jnp.asarray(value, points.dtype) for value in stage[:3]))
+            task = self._problem(mesh, constraints, sizes, aggregation)
+            task = eqx.tree_at(lambda t: t.aggregation.pivot, task, self._pivot(task, points))
+            valid = task.value(points, jnp.zeros((), points.dtype))[1] > 0
+            still = Minimised(points, jnp.zeros((), points.dtype), jnp.int32(0))
+            found = jax.lax.cond(stage.tangled & valid, lambda: still, lambda: self.minimiser(task, points))
+            return (found.points, count + found.iterations), None
+
+        (points, count), _ = jax.lax.scan(run, (points, jnp.int32(0)), stages)
+        finite = jnp.isfinite(points).all()
+        move = jnp.where(finite, points - mesh.points, 0)
+        return Proposal(move, count, jnp.zeros((), points.dtype))
+
+    def _begin(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Float[Array, "nodes dim"]:
+        """The points after the steps of the starting method."""
+        if self.start is None:
+            return mesh.points
+
+        def unfinished(carry):
+            _, before, count = carry
+            tangled = jnp.stack([(det <= 0).any() for det in before.jacobian]).any()
+            return count < jnp.where(tangled, self.untangling_steps, self.start_steps)
+
+        def step(carry):
+            points, before, count = carry
+            found = self.start.step(mesh.with_points(points), constraints, before)
+            return found.points, found.evaluation, count + 1
+
+        return jax.lax.while_loop(unfinished, step, (mesh.points, before, jnp.int32(0)))[0]
+
+    def _sizes(self, mesh: Mesh) -> tuple[Float[Array, " elements"], ...]:
+        own = target_measures(mesh)
+        if self.target != "given size":
+            return own
+        if isinstance(self.size, tuple):
+            return tuple(jnp.asarray(size, part.dtype) for size, part in zip(self.size, own, strict=True))
+        return tuple(jnp.full_like(part, self.size) for part in own)
+
+    def _problem(self, mesh, constraints, sizes, aggregation) -> Problem:
+        weight = 0.0 if self.target == "free size" else self.size_weight
+        return problem(mesh, constraints, sizes, aggregation, self.metric, weight)
+
+    def _pivot(self, task: Problem, points: Float[Array, "nodes dim"]) -> Float[Array, ""]:
+        """The e that so many of the elements with weight exceed."""
+        e, weight = task.inverse_quality(points)
+        ordered = jnp.sort(jnp.where((weight > 0) & jnp.isfinite(e), e, -jnp.inf))
+        behind = jnp.floor(self.pivot * jnp.sqrt((weight > 0).sum())).astype(jnp.int32)
+        return jnp.maximum(ordered[jnp.maximum(len(ordered) - 1 - behind, 0)], 1)

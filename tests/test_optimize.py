@@ -1,0 +1,254 @@
+"""The objective, its Hessian model, the minimisers, and the method."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsmooth.constraints import Constraints, detect_constraints
+from jaxsmooth.distortion import (
+    apply_model,
+    hessian_model,
+    inverse_quality,
+    model_diagonal,
+    positive_part,
+)
+from jaxsmooth.elements import element_type, supported
+from jaxsmooth.mesh import Mesh
+from jaxsmooth.methods.optimize import GOALS, Optimize
+from jaxsmooth.minimise import Jaxopt, Newton, Optax, Optimistix, regularisation
+from jaxsmooth.objective import Aggregation, problem
+from jaxsmooth.patches import evaluate
+
+jax.config.update("jax_enable_x64", True)
+
+RNG = np.random.default_rng
+
+
+def jiggled(kind, amplitude=0.05, seed=0):
+    return jnp.asarray(kind.ideal + amplitude * RNG(seed).standard_normal(kind.ideal.shape))
+
+
+def square(n=8, amplitude=0.3, seed=1, triangles=False):
+    """A grid of the unit square with its inner nodes displaced, and its boundary mask."""
+    x, y = np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, n + 1))
+    points = np.stack([x.ravel(), y.ravel()], axis=1)
+    held = ((points == 0) | (points == 1)).any(axis=1)
+    points[~held] += amplitude / n * RNG(seed).uniform(-1, 1, (int((~held).sum()), 2))
+    first = np.array([j * (n + 1) + i for j in range(n) for i in range(n)])
+    quads = np.stack([first, first + 1, first + n + 2, first + n + 1], axis=1)
+    if triangles:
+        return Mesh(points, {"triangle": np.r_[quads[:, :3], quads[:, [0, 2, 3]]]}), held
+    return Mesh(points, {"quad": quads}), held
+
+
+@jax.jit
+def _step(method, mesh, constraints):
+    return method.step(mesh, constraints, evaluate(mesh))
+
+
+def run(mesh, held, method=None):
+    constraints = held if isinstance(held, Constraints) else Constraints.hold(mesh, held)
+    method = Optimize() if method is None else method
+    return mesh.with_points(_step(method, mesh, constraints).points)
+
+
+def least(mesh):
+    q, det = evaluate(mesh)
+    return float(jnp.concatenate(q).min()), float(jnp.concatenate(det).min())
+
+
+KINDS = supported()
+# "shape" means the mean ratio for all types but these
+PAIRS = [(name, "shape") for name in KINDS] + [
+    (name, "mean_ratio") for name in ("triangle", "quad", "tetra", "hexahedron")
+]
+
+
+@pytest.mark.parametrize(("name", "metric"), PAIRS)
+def test_gradient_is_that_of_the_value(name, metric):
+    kind = element_type(name)
+    nodes, size, eps = jiggled(kind), jnp.float64(1.3), jnp.float64(0.1)
+    function = jax.jit(partial(inverse_quality, kind, metric, jnp.float64(0.5)))
+    direction = jnp.asarray(RNG(2).standard_normal(kind.ideal.shape))
+    h = 1e-6
+    up, down = (function(nodes + s * h * direction, size, eps)[0] for s in (1, -1))
+    # central differences: rounding eps / h and truncation h² are both below 1e-8
+    np.testing.assert_allclose(
+        jnp.vdot(function(nodes, size, eps)[1], direction), (up - down) / (2 * h), rtol=1e-6, atol=1e-8
+    )
+
+
+@pytest.mark.parametrize(("name", "metric"), PAIRS)
+def test_ideal_element_is_the_optimum(name, metric):
+    kind = element_type(name)
+    function = jax.jit(partial(inverse_quality, kind, metric, jnp.float64(1.0)))
+    best, gradient = function(jnp.asarray(kind.ideal), 1.0, 0.0)
+    np.testing.assert_allclose(best, 1, rtol=1e-9)
+    np.testing.assert_allclose(gradient, 0, atol=1e-9)
+    for seed in range(8):
+        assert function(jiggled(kind, 0.03, seed), 1.0, 0.0)[0] > 1
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_invariance_to_similarity(name):
+    kind = element_type(name)
+    nodes = jiggled(kind)
+    turn, _ = np.linalg.qr(RNG(3).standard_normal((kind.dim, kind.dim)))
+    turn[:, 0] *= np.linalg.det(turn)
+    moved = 7.0 * nodes @ jnp.asarray(turn).T + 3.0
+    values = [inverse_quality(kind, "shape", 0.0, x, 1.0, 0.0)[0] for x in (nodes, moved)]
+    np.testing.assert_allclose(values[0], values[1], rtol=1e-10)
+
+
+@pytest.mark.parametrize("name", ["triangle", "quad", "tetra", "wedge", "hexahedron", "tetra10"])
+def test_hessian_model_is_positive_and_its_diagonal_right(name):
+    kind = element_type(name)
+    aggregation = Aggregation(1.0, 1.0, 6.0, 1.2)
+    model = hessian_model(
+        kind, "shape", 0.5, aggregation.derivatives, jiggled(kind), jnp.float64(1.0), jnp.float64(0.0)
+    )
+    units = jnp.eye(kind.k * kind.dim).reshape(-1, kind.k, kind.dim)
+    matrix = jax.vmap(lambda u: apply_model(kind, u, model).reshape(-1))(units)
+    np.testing.assert_allclose(matrix, matrix.T, atol=1e-10 * float(jnp.abs(matrix).max()))
+    assert np.linalg.eigvalsh(matrix).min() > -1e-10 * np.abs(matrix).max()
+    blocks = matrix.reshape(kind.k, kind.dim, kind.k, kind.dim)
+    diagonal = np.stack([blocks[i, :, i] for i in range(kind.k)])
+    np.testing.assert_allclose(model_diagonal(kind, model), diagonal, atol=1e-10 * np.abs(diagonal).max())
+
+
+@pytest.mark.parametrize("name", ["triangle", "tetra"])
+def test_hessian_model_of_the_mean_ratio_is_exact_where_nothing_is_left_out(name):
+    """Along displacements that leave the determinant's second derivative out: one node's."""
+    kind = element_type(name)
+    nodes = jiggled(kind, 0.1)
+    model = hessian_model(
+        kind, "mean_ratio", 0.0, lambda e: (jnp.ones_like(e), jnp.zeros_like(e)), nodes, 1.0, 0.0
+    )
+    direction = jnp.zeros_like(nodes).at[0].set(jnp.asarray(RNG(4).standard_normal(kind.dim)))
+    gradient = lambda t: inverse_quality(kind, "mean_ratio", 0.0, nodes + t * direction, 1.0, 0.0)[1]  # noqa: E731
+    exact = jax.jvp(gradient, (0.0,), (1.0,))[1]
+    np.testing.assert_allclose(
+        jnp.vdot(apply_model(kind, direction, model), direction), jnp.vdot(exact, direction), rtol=1e-10
+    )
+
+
+def test_positive_part():
+    det = jnp.asarray([-2.0, -1e-3, 0.0, 1e-3, 2.0])
+    assert (positive_part(det, 0.1) > 0).all()
+    np.testing.assert_array_equal(positive_part(det, 0.0), jnp.maximum(det, 0))
+    slope = jax.vmap(jax.grad(positive_part), in_axes=(0, None))(det, 0.1)
+    assert ((slope > 0) & (slope < 1)).all()
+    assert regularisation(jnp.float64(0.1)) == 0
+    assert regularisation(jnp.float64(-1.0)) > 0.1
+
+
+def test_problem_gradient_and_value():
+    mesh, held = square()
+    sizes = (jnp.full(64, 1 / 64),)
+    task = problem(mesh, Constraints.hold(mesh, held), sizes, Aggregation(1.0, 1.0, 4.0))
+    value, gradient = task.value_and_grad(mesh.points, jnp.float64(0.0))
+    np.testing.assert_allclose(task.value(mesh.points, jnp.float64(0.0))[0], value, rtol=1e-12)
+    assert not np.asarray(gradient)[held].any()
+    direction = jnp.where(jnp.asarray(held)[:, None], 0, jnp.asarray(RNG(5).standard_normal((81, 2))))
+    h = 1e-7
+    up, down = (task.value(mesh.points + s * h * direction, jnp.float64(0.0))[0] for s in (1, -1))
+    np.testing.assert_allclose(jnp.vdot(gradient, direction), (up - down) / (2 * h), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "minimiser", [Newton(), Optimistix(), Jaxopt(), Optax()], ids=lambda m: type(m).__name__
+)
+@pytest.mark.filterwarnings("ignore")  # jaxopt says that it is not maintained
+def test_every_minimiser_reduces_the_objective(minimiser):
+    mesh, held = square(triangles=True)
+    constraints = Constraints.hold(mesh, held)
+    task = problem(mesh, constraints, (jnp.full(128, 1 / 128),), Aggregation(1.0, 1.0, 4.0))
+    found = jax.jit(minimiser)(task, mesh.points)
+    start = task.value(mesh.points, jnp.float64(0.0))[0]
+    best = jax.jit(Newton(iterations=40, tolerance=1e-10))(task, mesh.points).value
+    assert found.value < start
+    assert start - found.value > 0.9 * (start - best)
+    np.testing.assert_array_equal(found.points[held], mesh.points[held])
+    assert least(mesh.with_points(found.points))[1] > 0
+
+
+def test_goals_do_what_they_say():
+    mesh, held = square(amplitude=0.4, triangles=True, seed=7)
+    points = np.asarray(mesh.points).copy()
+    points[held, 0] += 0.1 * np.sin(3 * points[held, 1])  # a boundary that no regular mesh fits
+    mesh = mesh.with_points(jnp.asarray(points))
+    found = {goal: jnp.concatenate(evaluate(run(mesh, held, Optimize(goal=goal))).quality) for goal in GOALS}
+    before = evaluate(mesh).quality[0]
+    assert min(q.min() for q in found.values()) > before.min()
+    assert min(q.mean() for q in found.values()) > before.mean()
+    assert found["worst"].min() >= found["average"].min()
+    assert found["average"].mean() >= found["worst"].mean()
+
+
+def test_jiggled_grid_becomes_regular():
+    assert least(run(*square(amplitude=0.45)))[0] > 0.999
+
+
+def test_tangled_mesh_untangles():
+    mesh, held = square(amplitude=1.6, seed=3)
+    assert least(mesh)[1] < 0
+    assert least(run(mesh, held))[1] > 0
+
+
+def test_held_inverted_elements_do_no_harm():
+    mesh, _ = square(amplitude=1.6, seed=3)
+    everything = np.ones(len(mesh.points), bool)
+    np.testing.assert_array_equal(run(mesh, everything).points, mesh.points)
+
+
+def test_no_element_is_inverted_that_was_not():
+    for seed in range(3):
+        mesh, held = square(amplitude=2.5, seed=seed)
+        before, after = (np.asarray(evaluate(m).jacobian[0]) for m in (mesh, run(mesh, held)))
+        assert not ((before > 0) & (after <= 0)).any()
+
+
+def test_sliding_nodes_stay_on_their_lines():
+    mesh, _ = square()
+    points = np.asarray(mesh.points).copy()
+    points[3, 0] += 0.03  # on the bottom edge
+    mesh = mesh.with_points(jnp.asarray(points))
+    smoothed = np.asarray(run(mesh, detect_constraints(mesh)).points)
+    np.testing.assert_allclose(smoothed[:9, 1], 0, atol=1e-14)
+    assert least(mesh.with_points(jnp.asarray(smoothed)))[0] > 0.999
+
+
+def test_renumbering_changes_nothing():
+    mesh, held = square(triangles=True)
+    order = RNG(6).permutation(len(mesh.points))
+    place = np.argsort(order)
+    other = Mesh(np.asarray(mesh.points)[order], {"triangle": place[np.asarray(mesh.connectivity[0])][::-1]})
+    first, second = run(mesh, held), run(other, held[order])
+    # iterations stop by tolerances, so that rounding may show at their scale at most
+    np.testing.assert_allclose(np.asarray(first.points)[order], second.points, atol=1e-8)
+
+
+def test_given_size_pulls_measures_together():
+    mesh, held = square(n=6, amplitude=0.0, triangles=True)
+    points = np.asarray(mesh.points) ** np.array([1.6, 1.0])
+    mesh = mesh.with_points(jnp.asarray(points))
+
+    def spread(method):
+        areas = np.asarray(evaluate(run(mesh, held, method)).jacobian[0])
+        return areas.std() / areas.mean()
+
+    given = Optimize(target="given size", size=1 / 72, size_weight=10.0, start=None)
+    own = Optimize(target="own size", size_weight=100.0, start=None)
+    assert spread(given) < spread(own)
+
+
+def test_options_are_checked():
+    with pytest.raises(ValueError, match="goal"):
+        Optimize(goal="best")
+    with pytest.raises(ValueError, match="size"):
+        Optimize(target="given size")
