@@ -91,7 +91,9 @@ def detect_constraints(
             if choice == "fixed":
                 held[nodes] = True
             else:
-                normals.add(nodes, *_facet_normals(facets.type, points[nodes], noise, flatness))
+                normals.add(
+                    nodes, *_facet_normals(facets.type, points[nodes], noise[nodes].max(axis=1), flatness)
+                )
     if mesh.labels is not None:
         _add_features(mesh.labels, points, noise, flatness, normals, tangents, held)
 
@@ -107,24 +109,29 @@ def detect_constraints(
     return Constraints(jnp.asarray(projectors, mesh.points.dtype))
 
 
-def coordinate_error(points: np.ndarray) -> float:
-    """How far a coordinate may be off: by the rounding of its type, or of its file's digits.
+def coordinate_error(points: np.ndarray) -> np.ndarray:
+    """How far the coordinates of each node may be off ``[nodes]``.
 
-    Text files often carry six or seven significant digits; the least number (of five to nine)
-    that reproduces all coordinates is taken for theirs.
+    By the rounding of their type, which is relative to their size; or, where text files carry
+    few significant digits, by that: the least number (of five to nine) that reproduces all
+    coordinates is taken for theirs.
     """
-    values = np.abs(np.asarray(points)[np.asarray(points) != 0])
+    sizes = np.abs(np.asarray(points))
+    values = sizes[sizes != 0]
     if len(values) == 0:
-        return 0.0
-    single = values.dtype == np.float32 or (values == values.astype(np.float32)).all()
-    error = float(np.finfo(np.float32 if single else np.float64).eps) * float(values.max())
+        return np.zeros(len(points))
+    with np.errstate(over="ignore"):
+        single = values.dtype == np.float32 or (values == values.astype(np.float32)).all()
+    machine = float(np.finfo(np.float32 if single else np.float64).eps)
+    error = machine * sizes.max(axis=1).astype(np.float64)
     values = values.astype(np.float64)
     unit = 10.0 ** np.floor(np.log10(values))
     mantissa = values / unit
-    exact = 8 * np.finfo(np.float32 if single else np.float64).eps
     for decimals in range(4, 9):
-        if (np.abs(mantissa - np.round(mantissa, decimals)) <= exact * mantissa).all():
-            return max(error, 0.5 * 10.0**-decimals * float(unit.max()))
+        if 0.5 * 10.0**-decimals < 16 * machine:
+            break  # the type itself carries no more
+        if (np.abs(mantissa - np.round(mantissa, decimals)) <= 8 * machine * mantissa).all():
+            return np.maximum(error, 0.5 * 10.0**-decimals * float(unit.max()))
     return error
 
 
@@ -204,14 +211,14 @@ class _Directions:
         return np.where(folded, high - low, np.inf)[touched]
 
 
-def _tolerance(noise: float, length: np.ndarray, flatness: float | None) -> np.ndarray:
+def _tolerance(noise: np.ndarray, length: np.ndarray, flatness: float | None) -> np.ndarray:
     if flatness is not None:
         return np.full(len(length), float(flatness))
     return np.clip(noise / np.maximum(length, np.finfo(float).tiny), _FLAT, _ROUGH)
 
 
 def _facet_normals(
-    kind: ElementType, nodes: np.ndarray, noise: float, flatness: float | None
+    kind: ElementType, nodes: np.ndarray, noise: np.ndarray, flatness: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Unit normals ``[m, q, dim]`` at the quadrature points, and how well they are known."""
     tangents = np.einsum("mkd,qke->mqde", nodes, kind.slopes)
@@ -232,7 +239,7 @@ def _facet_normals(
 def _add_features(
     labels: Labels,
     points: np.ndarray,
-    noise: float,
+    noise: np.ndarray,
     flatness: float | None,
     normals: _Directions,
     tangents: _Directions,
@@ -247,19 +254,19 @@ def _add_features(
             continue
         kind = element_type(name)
         if kind.dim == 2 and dim == 3:
-            normals.add(nodes, *_facet_normals(kind, points[nodes], noise, flatness))
+            normals.add(nodes, *_facet_normals(kind, points[nodes], noise[nodes].max(axis=1), flatness))
             sides = nodes[:, kind.segments]
             edges.append(sides.reshape(-1, 2))
             edge_tags.append(np.repeat(tags, sides.shape[1]))
         elif kind.dim == 1:
             segments = nodes[:, kind.segments].reshape(-1, 2)
-            tangents.add(segments, *_unit_tangents(points[segments], noise, flatness))
+            tangents.add(segments, *_unit_tangents(points[segments], noise[segments].max(axis=1), flatness))
             ends.append(nodes[:, :2].reshape(-1))
             end_tags.append(np.repeat(tags, 2))
     if edges:
         pairs, tags = np.concatenate(edges), np.concatenate(edge_tags)
         border = pairs[_on_border(facet_keys(pairs, count), tags)]
-        tangents.add(border, *_unit_tangents(points[border], noise, flatness))
+        tangents.add(border, *_unit_tangents(points[border], noise[border].max(axis=1), flatness))
     if ends:
         nodes, tags = np.concatenate(ends), np.concatenate(end_tags)
         held[nodes[_on_border(nodes, tags)]] = True
@@ -274,7 +281,9 @@ def _on_border(keys: np.ndarray, tags: np.ndarray) -> np.ndarray:
     return (mixed | (number == 1))[group]
 
 
-def _unit_tangents(ends: np.ndarray, noise: float, flatness: float | None) -> tuple[np.ndarray, np.ndarray]:
+def _unit_tangents(
+    ends: np.ndarray, noise: np.ndarray, flatness: float | None
+) -> tuple[np.ndarray, np.ndarray]:
     vectors = ends[:, 1] - ends[:, 0]
     length = np.linalg.norm(vectors, axis=1)
     return (vectors / np.where(length > 0, length, 1)[:, None])[:, None], _tolerance(noise, length, flatness)

@@ -66,7 +66,7 @@ class Optimize(Method):
         untangling_steps: their number while elements are inverted.
         guard: refuses moves that invert an element.
 
-    A step is the whole optimisation.  It is not differentiable in reverse mode.
+    A step is a whole optimisation; another one goes on from there.  It is not differentiable in reverse mode.
     """
 
     goal: str = eqx.field(static=True, default="balanced")
@@ -91,24 +91,34 @@ class Optimize(Method):
     def propose(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Proposal:
         """The displacement to the optimised mesh."""
         mesh, constraints = jax.lax.stop_gradient((mesh, constraints))
-        points = self._begin(mesh, constraints, before)
         sizes = self._sizes(mesh)
         stages = jax.tree.map(lambda *values: jnp.stack([jnp.asarray(v) for v in values]), *GOALS[self.goal])
 
-        def run(carry, stage):
-            points, count = carry
+        def task_of(stage, points):
             aggregation = Aggregation(*(jnp.asarray(value, points.dtype) for value in stage[:3]))
             task = self._problem(mesh, constraints, sizes, aggregation)
-            task = eqx.tree_at(lambda t: t.aggregation.pivot, task, self._pivot(task, points))
-            valid = task.value(points, jnp.zeros((), points.dtype))[1] > 0
-            still = Minimised(points, jnp.zeros((), points.dtype), jnp.int32(0))
+            return eqx.tree_at(lambda t: t.aggregation.pivot, task, self._pivot(task, points))
+
+        zero = jnp.zeros((), mesh.points.dtype)
+        last = task_of(jax.tree.map(lambda values: values[-1], stages), mesh.points)
+        # the start is for meshes that it helps: an optimised one goes on where it is
+        value, worst = last.value(mesh.points, zero)
+        begun = self._begin(mesh, constraints, before)
+        helped = (last.value(begun, zero)[0] < value) | (worst <= 0)
+        points = jnp.where(helped, begun, mesh.points)
+
+        def run(carry, stage):
+            points, count = carry
+            task = task_of(stage, points)
+            valid = task.value(points, zero)[1] > 0
+            still = Minimised(points, zero, jnp.int32(0))
             found = jax.lax.cond(stage.tangled & valid, lambda: still, lambda: self.minimiser(task, points))
             return (found.points, count + found.iterations), None
 
         (points, count), _ = jax.lax.scan(run, (points, jnp.int32(0)), stages)
         finite = jnp.isfinite(points).all()
         move = jnp.where(finite, points - mesh.points, 0)
-        return Proposal(move, count, jnp.zeros((), points.dtype))
+        return Proposal(move, count, zero)
 
     def _begin(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Float[Array, "nodes dim"]:
         """The points after the steps of the starting method."""
