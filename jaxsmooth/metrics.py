@@ -38,7 +38,7 @@ def surface(kind: ElementType, nodes: Nodes) -> Scalar:
     return norm(normals) @ jnp.asarray(kind.facet_weights, nodes.dtype)
 
 
-def shape_quality(kind: ElementType, nodes: Nodes, beta: float = 2.0) -> Scalar:
+def shape_quality(kind: ElementType, nodes: Nodes, beta: Scalar | float = 2.0) -> Scalar:
     """The paper's metric, Eqs. 1–5, times the sign of the measure.
 
     ``q = 1 − |1 − (m_r / m)^β|`` with m the perimeter or surface area and m_r that of the

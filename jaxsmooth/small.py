@@ -40,7 +40,7 @@ def norm(vectors: Float[Array, "... dim"]) -> Float[Array, ...]:
     return power((vectors * vectors).sum(axis=-1), 0.5)
 
 
-def power(base: Float[Array, ...], exponent: float) -> Float[Array, ...]:
+def power(base: Float[Array, ...], exponent: Float[Array, ""] | float) -> Float[Array, ...]:
     """``base ** exponent`` for ``base >= 0``, with derivative zero where the base is zero."""
     positive = base > 0
     return jnp.where(positive, jnp.where(positive, base, 1) ** exponent, 0)

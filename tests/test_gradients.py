@@ -86,21 +86,27 @@ def test_a_run_whose_guard_is_active():
 
 
 def test_parameters_of_the_method(square):
-    """α, and the elastic constants: E does not matter, ν does."""
+    """α, β, and the elastic constants: E does not matter, ν does."""
     mesh, constraints, weights, _ = square
 
     def function(values):
         method = js.Elastic(
             extended=True,
             alpha=values["alpha"],
+            beta=values["beta"],
             material=Material(values["young"], values["poisson"]),
             guard=None,
             tolerance=EXACT,
         )
         return objective(js.run(mesh, method, constraints=constraints, steps=2), weights)
 
-    at = {"alpha": jnp.asarray(0.9), "young": jnp.asarray(2.0), "poisson": jnp.asarray(0.2)}
-    gradient = check(function, at, {"alpha": 1.0, "young": 0.5, "poisson": 0.7}, step=1e-5)
+    at = {
+        "alpha": jnp.asarray(0.9),
+        "beta": jnp.asarray(1.8),
+        "young": jnp.asarray(2.0),
+        "poisson": jnp.asarray(0.2),
+    }
+    gradient = check(function, at, {"alpha": 1.0, "beta": 0.6, "young": 0.5, "poisson": 0.7}, step=1e-5)
     assert abs(float(gradient["young"])) < 1e-9 < abs(float(gradient["poisson"]))
 
 

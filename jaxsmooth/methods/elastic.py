@@ -29,6 +29,7 @@ class Elastic(Method):
     Attributes:
         extended: weigh the element forces by (1 − q) / (1 − q_min) (Eq. 35).
         alpha: reduction factor of the target elements (Eq. 36).
+        beta: exponent of the quality in the weights of the extended method (Eqs. 1, 2).
         material: Young's modulus and Poisson's ratio of the elements.
         guard: the patch guard (Eq. 34), or None for the full step.
         tolerance: relative residual of the linear system.  The mesh does not profit from a
@@ -38,6 +39,7 @@ class Elastic(Method):
 
     extended: bool = eqx.field(static=True, default=False)
     alpha: Float[Array, ""] | float = 1.0
+    beta: Float[Array, ""] | float = 2.0
     material: Material = Material()
     guard: PatchGuard | None = PatchGuard()
     tolerance: float = 1e-2
@@ -72,10 +74,13 @@ class Elastic(Method):
             )
         )
 
-    @staticmethod
-    def priorities(mesh: Mesh) -> tuple[Float[Array, " elements"], ...]:
+    def priorities(self, mesh: Mesh) -> tuple[Float[Array, " elements"], ...]:
         """(1 − q) / (1 − q_min) of Eq. 35; zero where all elements are ideal."""
-        q = tuple(jax.vmap(partial(shape_quality, k))(gather(mesh.points, n)) for k, n in mesh.blocks)
+
+        def quality(kind, nodes):
+            return shape_quality(kind, nodes, self.beta)
+
+        q = tuple(jax.vmap(partial(quality, kind))(gather(mesh.points, nodes)) for kind, nodes in mesh.blocks)
         gap = 1 - jnp.stack([part.min() for part in q]).min()
         perfect = gap <= 0
         return tuple(jnp.where(perfect, 0, (1 - part) / jnp.where(perfect, 1, gap)) for part in q)
