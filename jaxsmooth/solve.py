@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsmooth.small import cofactors, determinant
 
@@ -50,6 +50,22 @@ def block_inverse(blocks: Float[Array, "nodes dim dim"]) -> Float[Array, "nodes 
 
 _RESTARTS = 4
 _PATIENCE = 10  # times more iterations for a differentiated solve
+_ROUNDING = 4  # iterations a degree of freedom, where exact arithmetic needs one
+
+
+class _Iterate(NamedTuple):
+    """State of the iteration: solution, residual, direction; r·z, r·r, and r·r when last true."""
+
+    x: Field
+    r: Field
+    p: Field
+    rho: Float[Array, ""]
+    square: Float[Array, ""]
+    confirmed: Float[Array, ""]
+    count: Int[Array, ""]
+    restarts: Int[Array, ""]
+    check: Bool[Array, ""]
+    done: Bool[Array, ""]
 
 
 def conjugate_gradients(
@@ -63,44 +79,47 @@ def conjugate_gradients(
 
     The right-hand side is scaled to unit size first, so that tiny ones (cotangents) are solved
     as well as large ones.  When the recursion says that it has converged the true residual is
-    computed, and the iteration starts again from there if it disagrees.
+    computed, and the iteration starts again from there if it disagrees, as long as that helps.
     """
     size = jnp.abs(right).max()
     empty = ~(size > 0)
     b = right / jnp.where(empty, 1, size)
-    goal = (tolerance**2) * jnp.vdot(b, b)
+    unit = jnp.vdot(b, b)
+    goal = (tolerance**2) * unit
+    bound = jnp.minimum(max_iterations, _ROUNDING * right.size)
 
-    def restart(carry):
-        x, count, restarts, _ = carry
-        r = b - matvec(x)
+    def iterate(s: _Iterate) -> _Iterate:
+        # One product serves both: with the direction, or, to check, with the solution.
+        product = matvec(jnp.where(s.check, s.x, s.p))
+        curvature = jnp.vdot(s.p, product)
+        step = jnp.where(s.check | ~(curvature > 0), 0, s.rho / jnp.where(curvature > 0, curvature, 1))
+        x = s.x + step * s.p
+        r = jnp.where(s.check, b, s.r) - jnp.where(s.check, 1, step) * product
         z = precondition(r)
+        rho, square = jnp.vdot(r, z), jnp.vdot(r, r)
+        turn = jnp.where(s.check | ~(s.rho > 0), 0, rho / jnp.where(s.rho > 0, s.rho, 1))
+        count = s.count + ~s.check
+        full = count >= bound
+        helped = (square < s.confirmed / 4) & (s.restarts < _RESTARTS)
+        return _Iterate(
+            x,
+            r,
+            z + turn * s.p,
+            rho,
+            square,
+            confirmed=jnp.where(s.check, square, s.confirmed),
+            count=count,
+            restarts=s.restarts + s.check,
+            check=~s.check & (~(square > goal) | full),
+            done=s.check & (~(square > goal) | full | ~helped),
+        )
 
-        def more(state):
-            _, r, _, _, n = state
-            return (jnp.vdot(r, r) > goal) & (n < max_iterations)
-
-        def iterate(state):
-            x, r, p, rho, n = state
-            ap = matvec(p)
-            curvature = jnp.vdot(p, ap)
-            step = jnp.where(curvature > 0, rho / jnp.where(curvature > 0, curvature, 1), 0)
-            x, r = x + step * p, r - step * ap
-            z = precondition(r)
-            next_rho = jnp.vdot(r, z)
-            return x, r, z + next_rho / jnp.where(rho > 0, rho, 1) * p, next_rho, n + 1
-
-        x, _, _, _, count = jax.lax.while_loop(more, iterate, (x, r, z, jnp.vdot(r, z), count))
-        r = b - matvec(x)
-        return x, count, restarts + 1, jnp.vdot(r, r)
-
-    def unfinished(carry):
-        _, count, restarts, square = carry
-        return (square > goal) & (count < max_iterations) & (restarts < _RESTARTS)
-
-    start = (jnp.zeros_like(b), jnp.int32(0), jnp.int32(0), jnp.vdot(b, b))
-    x, count, _, square = jax.lax.while_loop(unfinished, restart, start)
-    residual = jnp.sqrt(square / jnp.where(empty, 1, jnp.vdot(b, b)))
-    return Solution(x * jnp.where(empty, 0, size), count, residual)
+    z = precondition(b)
+    zero, no = jnp.int32(0), jnp.bool_(False)
+    start = _Iterate(jnp.zeros_like(b), b, z, jnp.vdot(b, z), unit, unit, zero, zero, no, ~(unit > goal))
+    end = jax.lax.while_loop(lambda s: ~s.done, iterate, start)
+    residual = jnp.sqrt(end.square / jnp.where(empty, 1, unit))
+    return Solution(end.x * jnp.where(empty, 0, size), end.count, residual)
 
 
 def solve_projected(
@@ -173,8 +192,13 @@ def _equations(system, tolerance, max_iterations):
     def matvec(u: Field) -> Field:
         return project(projectors, operator(project(projectors, u))) + project(rest, u)
 
-    def solver(matvec, b):
-        solution = conjugate_gradients(matvec, b, lambda r: project(inverse, r), tolerance, max_iterations)
-        return solution.field, (solution.iterations, solution.residual)
+    def within(u: Field) -> Field:
+        """The same on the null space, which the iteration does not leave."""
+        return project(projectors, operator(u))
+
+    def solver(_, b):
+        inside = project(projectors, b)  # a cotangent has a part outside, where A is the identity
+        found = conjugate_gradients(within, inside, lambda r: project(inverse, r), tolerance, max_iterations)
+        return found.field + (b - inside), (found.iterations, found.residual)
 
     return matvec, project(projectors, force), solver

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import reference
 
-from jaxsmooth.constraints import detect_constraints
+from jaxsmooth.constraints import Constraints, detect_constraints
 from jaxsmooth.elasticity import Material
 from jaxsmooth.mesh import Mesh
 from jaxsmooth.methods.elastic import Elastic
@@ -139,6 +139,29 @@ def test_running_out_of_iterations_is_reported():
     )
     assert int(found.iterations) == 3
     assert float(found.residual) > 1e-3
+
+
+def test_a_singular_system_ends():
+    """Nothing holds this mesh: the force is consistent, a cotangent is not."""
+    points, blocks = meshes.grid("triangle", amplitude=0.2)
+    mesh = Mesh(points, blocks)
+    free = Constraints.hold(mesh, np.zeros(len(points), bool))
+    stiffness = reference.assemble(points, blocks).toarray()
+    found = proposal(Elastic(tolerance=1e-10), mesh, free)
+    assert float(found.residual) <= 1e-10
+
+    @jax.jit
+    def pulled(force, cotangent):
+        k = jnp.asarray(stiffness)
+        diagonal = jnp.einsum("ninj->nij", k.reshape(len(points), 2, len(points), 2))
+        solve = lambda f: solve_projected(Dense(k), diagonal, free.projectors, f, 1e-2, 1000)  # noqa: E731
+        found = solve(cotangent)
+        return found.iterations, jax.vjp(lambda f: solve(f).field, force)[1](cotangent)[0]
+
+    force = reference.forces(points, blocks)
+    iterations, slope = pulled(force, np.random.default_rng(0).normal(size=points.shape))
+    assert int(iterations) <= 4 * points.size
+    assert np.isfinite(np.asarray(slope)).all()
 
 
 def test_block_inverse():
