@@ -69,8 +69,8 @@ def _rotation_jvp(primals: tuple[Matrix], tangents: tuple[Matrix]) -> tuple[Matr
 def _rotation_2d(h: Matrix) -> Matrix:
     h = _scaled(h)
     cosine, sine = h[0, 0] + h[1, 1], h[0, 1] - h[1, 0]
-    length = norm(jnp.stack([cosine, sine]))
-    regular = length > 0
+    length = jnp.sqrt(cosine * cosine + sine * sine)
+    regular = length > 4 * jnp.finfo(h.dtype).eps  # less is rounding
     scale = 1 / jnp.where(regular, length, 1)
     cosine, sine = jnp.where(regular, cosine * scale, 1), sine * scale
     return jnp.stack([jnp.stack([cosine, -sine]), jnp.stack([sine, cosine])])
@@ -93,44 +93,53 @@ def _rotation_3d(h: Matrix) -> Matrix:
     def cross(a, b):
         return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
-    def sweep(_, pair):
-        columns, axes = list(pair[0]), list(pair[1])
-        for p, q in ((0, 1), (0, 2), (1, 2)):
-            gap = dot(columns[q], columns[q]) - dot(columns[p], columns[p])
-            overlap = 2 * dot(columns[p], columns[q])
-            root = jnp.abs(gap) + jnp.sqrt(gap * gap + overlap * overlap)
-            tangent = jnp.where(gap >= 0, overlap, -overlap) / (root + tiny)
-            cosine = 1 / jnp.sqrt(1 + tangent * tangent)
-            sine = cosine * tangent
-            for m in (columns, axes):
-                m[p], m[q] = (
-                    tuple(cosine * x - sine * y for x, y in zip(m[p], m[q], strict=True)),
-                    tuple(sine * x + cosine * y for x, y in zip(m[p], m[q], strict=True)),
-                )
-        return tuple(columns), tuple(axes)
+    def angle(a, b):
+        """Cosine and sine of the rotation that makes two columns orthogonal."""
+        gap, overlap = dot(b, b) - dot(a, a), 2 * dot(a, b)
+        root = jnp.abs(gap) + jnp.sqrt(gap * gap + overlap * overlap)
+        tangent = jnp.where(gap >= 0, overlap, -overlap) / (root + tiny)
+        cosine = 1 / jnp.sqrt(1 + tangent * tangent)
+        return cosine, cosine * tangent
 
-    start = tuple(tuple(h[i, j] for i in range(3)) for j in range(3))
-    unit = tuple(tuple(jnp.full_like(h[0, 0], i == j) for i in range(3)) for j in range(3))
-    columns, axes = jax.lax.fori_loop(0, _SWEEPS, sweep, (start, unit))
-    columns, axes = list(columns), list(axes)
-    lengths = [dot(c, c) for c in columns]
-    for i, j in ((0, 1), (1, 2), (0, 1)):  # longest first
-        swap = lengths[i] < lengths[j]
-        for m in (columns, axes):
-            m[i], m[j] = (
-                tuple(jnp.where(swap, y, x) for x, y in zip(m[i], m[j], strict=True)),
-                tuple(jnp.where(swap, x, y) for x, y in zip(m[i], m[j], strict=True)),
-            )
-        lengths[i], lengths[j] = (
-            jnp.where(swap, lengths[j], lengths[i]),
-            jnp.where(swap, lengths[i], lengths[j]),
+    def turn(triple, cosine, sine):
+        """Rotate the first two vectors, then renumber: 0, 1, 2 become 2, 0, 1."""
+        a, b, c = triple
+        first = tuple(cosine * x - sine * y for x, y in zip(a, b, strict=True))
+        return tuple(sine * x + cosine * y for x, y in zip(a, b, strict=True)), c, first
+
+    # The compiler may evaluate an expression once for every result that uses it, each time with
+    # other rounding.  Every decision (the sign of an angle, which column is longest) therefore
+    # depends on numbers that the loop stores: taken twice, it is taken alike.
+    def rotate(_, state):
+        columns, axes, (cosine, sine), _ = state
+        columns, axes = turn(columns, cosine, sine), turn(axes, cosine, sine)
+        return columns, axes, angle(*columns[:2]), tuple(dot(c, c) for c in columns)
+
+    columns = tuple(tuple(h[i, j] for i in range(3)) for j in range(3))
+    axes = tuple(tuple(jnp.full_like(h[0, 0], i == j) for i in range(3)) for j in range(3))
+    state = columns, axes, angle(*columns[:2]), columns[0]
+    columns, axes, _, lengths = jax.lax.fori_loop(0, 3 * _SWEEPS, rotate, state)
+
+    def pick(which, triple):
+        return tuple(
+            jnp.where(which[0], x, jnp.where(which[1], y, z)) for x, y, z in zip(*triple, strict=True)
         )
-    first = _unit_or(columns[0], (1.0, 0.0, 0.0), dot)
+
+    x, y, z = lengths
+    longest = (x >= y) & (x >= z), (y > x) & (y >= z)
+    # of the two others the longer one, in cyclic order
+    middle = (
+        jnp.where(longest[0], False, jnp.where(longest[1], x > z, x >= y)),
+        jnp.where(longest[0], y >= z, jnp.where(longest[1], False, y > x)),
+    )
+    long, short = pick(longest, columns), pick(middle, columns)
+    first = _unit_or(long, (1.0, 0.0, 0.0), dot)
     # a needle has no second direction: any normal to the first one is a minimiser
-    spare = cross(first, _least_axis(first))
-    second = _unit_or(columns[1], _unit_or(spare, (0.0, 1.0, 0.0), dot), dot)
+    spare = cross(first, _least_axis(long))
+    second = _unit_or(short, _unit_or(spare, (0.0, 1.0, 0.0), dot), dot)
     u = (first, second, cross(first, second))
-    v = (axes[0], axes[1], cross(axes[0], axes[1]))
+    v = (pick(longest, axes), pick(middle, axes))
+    v = (*v, cross(*v))
     return jnp.stack(
         [jnp.stack([sum(v[m][i] * u[m][j] for m in range(3)) for j in range(3)]) for i in range(3)]
     )

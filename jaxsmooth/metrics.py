@@ -13,11 +13,12 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsmooth.elements import ElementType
 from jaxsmooth.mesh import Mesh, gather
-from jaxsmooth.small import contract, determinant, norm, power
+from jaxsmooth.small import contract, determinant, least, norm, power
 
 __all__ = ["METRICS", "Metric", "measure", "metric", "quality", "quality_mean", "surface"]
 
@@ -60,13 +61,13 @@ def min_jacobian(kind: ElementType, nodes: Nodes) -> Scalar:
     Relative to the ideal element of unit measure: the ideal element of measure V has V.
     An element is *inverted* where this is not positive.
     """
-    return determinant(contract(nodes, jnp.asarray(kind.validity_gradients, nodes.dtype))).min()
+    return least(determinant(contract(nodes, jnp.asarray(kind.validity_gradients, nodes.dtype))))
 
 
-def _corner_frames(kind: ElementType, nodes: Nodes) -> tuple[Array, Array]:
-    frames = contract(nodes, jnp.asarray(kind.corner_frames, nodes.dtype))
-    ideal = contract(jnp.asarray(kind.ideal, nodes.dtype), jnp.asarray(kind.corner_frames, nodes.dtype))
-    return frames, ideal
+def _corner_frames(kind: ElementType, nodes: Nodes) -> tuple[Array, np.ndarray]:
+    """Edge tangents at the corners, of an element and of the ideal one (constants)."""
+    ideal = np.einsum("kd,qkj->qdj", kind.ideal, kind.corner_frames)
+    return contract(nodes, jnp.asarray(kind.corner_frames, nodes.dtype)), ideal
 
 
 def scaled_jacobian(kind: ElementType, nodes: Nodes) -> Scalar:
@@ -83,7 +84,7 @@ def scaled_jacobian(kind: ElementType, nodes: Nodes) -> Scalar:
         return jnp.where(solid, determinant(frames) / jnp.where(solid, lengths, 1), 0)
 
     frames, ideal = _corner_frames(kind, nodes)
-    return (scaled(frames) / scaled(ideal)).min()
+    return least(scaled(frames) / scaled(jnp.asarray(ideal, frames.dtype)))
 
 
 def mean_ratio(kind: ElementType, nodes: Nodes) -> Scalar:
@@ -94,7 +95,7 @@ def mean_ratio(kind: ElementType, nodes: Nodes) -> Scalar:
     Joe's ``12 (3V)^(2/3) / Σl²``.
     """
     frames, ideal = _corner_frames(kind, nodes)
-    jacobians = frames @ jnp.linalg.inv(ideal)
+    jacobians = frames @ jnp.asarray(np.linalg.inv(ideal), frames.dtype)
     det, size = determinant(jacobians), (jacobians**2).sum(axis=(-1, -2))
     valid = (det > 0).all()
     det = jnp.where(valid, det, 1)
@@ -105,8 +106,8 @@ def mean_ratio(kind: ElementType, nodes: Nodes) -> Scalar:
 def edge_ratio(kind: ElementType, nodes: Nodes) -> Scalar:
     """Shortest over longest edge, between corner nodes."""
     lengths = norm(nodes[kind.edges[:, 0]] - nodes[kind.edges[:, 1]])
-    longest = lengths.max()
-    return jnp.where(longest > 0, lengths.min() / jnp.where(longest > 0, longest, 1), 0)
+    longest = -least(-lengths)
+    return jnp.where(longest > 0, least(lengths) / jnp.where(longest > 0, longest, 1), 0)
 
 
 @dataclass(frozen=True)

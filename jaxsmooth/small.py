@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-__all__ = ["cofactors", "contract", "determinant", "norm", "power", "solve_regular"]
+__all__ = ["cofactors", "contract", "determinant", "least", "norm", "power", "solve_regular"]
 
 
 def contract(points: Float[Array, "k dim"], gradients: Float[Array, "q k j"]) -> Float[Array, "q dim j"]:
@@ -44,6 +45,23 @@ def power(base: Float[Array, ...], exponent: Float[Array, ""] | float) -> Float[
     """``base ** exponent`` for ``base >= 0``, with derivative zero where the base is zero."""
     positive = base > 0
     return jnp.where(positive, jnp.where(positive, base, 1) ** exponent, 0)
+
+
+@jax.custom_jvp
+def least(values: Float[Array, " n"]) -> Float[Array, ""]:
+    """The minimum; its derivative is that of one of the least values.
+
+    The derivative of `jnp.min` shares it among the values equal to the minimum, and is 0/0 where
+    the compiler has rounded the two sides of that comparison differently.
+    """
+    return values.min()
+
+
+@least.defjvp
+def _least_jvp(primals, tangents):
+    (values,), (change,) = primals, tangents
+    chosen = jnp.arange(len(values)) == jnp.argmin(values)
+    return least(values), jnp.where(chosen, change, 0).sum()
 
 
 def solve_regular(a: Float[Array, "dim dim"], b: Float[Array, " dim"], floor: float) -> Float[Array, " dim"]:

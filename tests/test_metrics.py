@@ -15,6 +15,7 @@ from scipy.spatial import ConvexHull
 from jaxsmooth.elements import element_type
 from jaxsmooth.mesh import Mesh
 from jaxsmooth.metrics import METRICS, metric, quality, quality_mean, surface
+from jaxsmooth.small import least
 
 KINDS = meshes.KINDS
 TABLE = json.loads((Path(__file__).parent / "data" / "quality_tables.json").read_text())["elements"]
@@ -270,3 +271,11 @@ def test_unknown_metric_suggests_a_name():
         metric("scaled_jacobean")
     with pytest.raises(ValueError, match=r"unknown metric 'zzz'; known are shape, "):
         quality(Mesh(*meshes.grid("quad")), "zzz")
+
+
+def test_derivative_of_the_least_value():
+    values = jnp.array([3.0, 1.0, 2.0, 1.0])
+    np.testing.assert_array_equal(jax.grad(least)(values), [0, 1, 0, 0])  # one of the two
+    assert float(least(values)) == 1
+    assert np.isnan(least(values.at[2].set(jnp.nan)))
+    np.testing.assert_array_equal(jax.hessian(lambda v: least(v) ** 2)(values)[1], [0, 2, 0, 0])

@@ -16,6 +16,7 @@ from jaxsmooth.mesh import Mesh, gather, scatter_add
 from jaxsmooth.methods.base import Method, Proposal
 from jaxsmooth.metrics import measure, shape_quality
 from jaxsmooth.patches import Evaluation, PatchGuard, patch_mean
+from jaxsmooth.small import least
 from jaxsmooth.solve import solve_projected
 
 __all__ = ["Elastic"]
@@ -81,7 +82,7 @@ class Elastic(Method):
             return shape_quality(kind, nodes, self.beta)
 
         q = tuple(jax.vmap(partial(quality, kind))(gather(mesh.points, nodes)) for kind, nodes in mesh.blocks)
-        gap = 1 - jnp.stack([part.min() for part in q]).min()
+        gap = 1 - least(jnp.concatenate(q))
         perfect = gap <= 0
         return tuple(jnp.where(perfect, 0, (1 - part) / jnp.where(perfect, 1, gap)) for part in q)
 
