@@ -31,6 +31,7 @@ __all__ = [
 
 METRICS = ("shape", "mean_ratio")
 _SKEW = 0.5  # weight of the corner term beside the isoperimetric one
+_ROUND = 0.02  # radius of the rounded kink of `_excess`
 
 Nodes = Float[Array, "k dim"]
 Scalar = Float[Array, ""]
@@ -62,6 +63,12 @@ def isoperimetric(kind: ElementType, metric: str) -> bool:
     return metric == "shape" and kind.name in ("triangle", "quad", "tetra", "hexahedron")
 
 
+def _bounded(kind: ElementType, metric: str) -> bool:
+    """Whether the paper's q only bounds the metric, which is the mean ratio: for wedges and
+    pyramids, some of which have less surface than the ideal one."""
+    return metric == "shape" and kind.name in ("wedge", "pyramid")
+
+
 def _sampled(kind: ElementType, metric: str) -> bool:
     """Whether the metric looks at the Jacobian at sample points: where it varies, or alone counts."""
     return not isoperimetric(kind, metric) or len(kind.validity_gradients) > 1
@@ -73,6 +80,13 @@ def _points(kind: ElementType) -> np.ndarray:
     every = kind.validity_gradients
     nodal = len(every) - len(kind.gradients)
     return every[:nodal] if kind.order == 1 and nodal else every
+
+
+def _excess(ratio: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+    """About ``max(ratio − 1, 0)``, rounded to be smooth and convex, with two derivatives."""
+    x = jnp.maximum(ratio - 1, 0)
+    total = x + _ROUND
+    return x * x / total, x * (x + 2 * _ROUND) / total**2, jnp.where(x > 0, 2 * _ROUND**2 / total**3, 0)
 
 
 class _Volume(NamedTuple):
@@ -173,13 +187,16 @@ def _metric(kind: ElementType, metric: str, size_weight, nodes: Nodes, size, eps
     value = size_weight * ((stretch + 1 / stretch) / 2 - 1)
     gradient = size_weight * (1 - 1 / stretch**2) / (2 * size) * volume.gradient
     surface = samples = None
-    if isoperimetric(kind, metric):
+    if isoperimetric(kind, metric) or _bounded(kind, metric):
         surface = _surface(kind, nodes)
         ratio = (surface.value / kind.ideal_surface) ** 2 / volume.value ** (2 * (dim - 1) / dim)
-        value = value + ratio
-        gradient = gradient + 2 * ratio * (
-            surface.gradient / surface.value - (dim - 1) / dim * volume.gradient / volume.value
+        slope = (
+            2 * ratio * (surface.gradient / surface.value - (dim - 1) / dim * volume.gradient / volume.value)
         )
+        if _bounded(kind, metric):
+            ratio, rise, _ = _excess(ratio)
+            slope = rise * slope
+        value, gradient = value + ratio, gradient + slope
     if _sampled(kind, metric):
         mean, slope, samples = _samples(kind, metric, nodes, size, eps)
         weight = _SKEW if isoperimetric(kind, metric) else 1.0
@@ -197,12 +214,13 @@ def inverse_quality(
     q is blunt about corners, so elements whose Jacobian varies add the excess of the mean over
     the sample points of ``|A|² / (d det(A)^(2/d))``; for quadrilaterals and hexahedra with the
     columns of A normalised, which leaves aspect ratios to q: it is the scaled Jacobian to the
-    power −2/d.  ``mean_ratio``: the mean over the sample points of ``|A|² / (d det(A)^(2/d))``,
+    power −2/d.  Wedges and pyramids take the mean ratio and the excess of the inverse q over 1.
+    ``mean_ratio``: the mean over the sample points of ``|A|² / (d det(A)^(2/d))``,
     A the deformation gradient from the ideal element (Knupp 2001).
 
     Args:
         kind: the element type.
-        metric: ``"shape"`` or ``"mean_ratio"``; wedges and pyramids always take the latter.
+        metric: ``"shape"`` or ``"mean_ratio"``; quadratic elements always take the latter.
         size_weight: of ``(τ + 1/τ)/2 − 1``, τ the measure over the target's; 0 leaves it free.
         nodes: ``[k, dim]``.
         size: measure of the target element.
@@ -218,8 +236,8 @@ class Model(NamedTuple):
     Attributes:
         facets: ``[s, dim−1, dim−1]``: metric tensors of the facets, times what they weigh.
         samples: see `Samples`.
-        vectors: nodal fields ``[3, k, dim]`` whose products with a displacement are squared:
-            isoperimetric ratio, size, and the gradient of e.
+        vectors: nodal fields ``[m, k, dim]`` whose products with a displacement are squared:
+            the gradients of e, of the size, and of the isoperimetric ratio.
     """
 
     facets: Array | None
@@ -254,10 +272,16 @@ def hessian_model(
         # S^d / V^(d−1) has second differential ∝ (dS − S/V dV)² where S and V are linear
         ratio = (surface.value / kind.ideal_surface) ** 2 / volume.value ** (2 * (dim - 1) / dim)
         change = surface.gradient / surface.value - volume.gradient / volume.value
-        vectors.append(jnp.sqrt(first * 2 * (dim - 1) * ratio) * change)
-        facets = first * 2 * ratio / surface.value * surface.pull
+        weight = first
+        if _bounded(kind, metric):
+            _, rise, bend = _excess(ratio)
+            weight = first * rise
+            slope = surface.gradient / surface.value - (dim - 1) / dim * volume.gradient / volume.value
+            vectors.append(jnp.sqrt(first * bend) * 2 * ratio * slope)
+        vectors.append(jnp.sqrt(weight * 2 * (dim - 1) * ratio) * change)
+        facets = weight * 2 * ratio / surface.value * surface.pull
     if samples is not None:
-        weight = first * (_SKEW if surface is not None else 1)
+        weight = first * (_SKEW if isoperimetric(kind, metric) else 1)
         samples = samples._replace(factors=weight * samples.factors)
     return Model(facets, samples, jnp.stack(vectors))
 

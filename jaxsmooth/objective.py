@@ -15,7 +15,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsmooth.constraints import Constraints
@@ -28,7 +27,6 @@ from jaxsmooth.solve import block_inverse, project
 __all__ = ["Aggregation", "Problem", "problem"]
 
 _CPU_CHUNK = 1024  # elements whose intermediates stay in the second-level cache
-_WEIGHT_POWER = 2 / 3
 
 Field = Float[Array, "nodes dim"]
 Scalar = Float[Array, ""]
@@ -73,7 +71,7 @@ class Block(eqx.Module):
 class Problem(eqx.Module):
     """The objective of a mesh as a function of its points, within its constraints.
 
-    Elements without a free node have no weight; the others have that of their type.
+    Elements without a free node have no weight; all others count alike.
     """
 
     projectors: Float[Array, "nodes dim dim"]
@@ -189,16 +187,6 @@ def _whole(kind: ElementType, weight: Array, nodes: Array) -> Array:
     return jnp.where(weight.reshape(shape) > 0, nodes, jnp.asarray(kind.ideal, nodes.dtype))
 
 
-def type_weight(kind: ElementType) -> float:
-    """Measure of the ideal element of unit edge length, to the power 2/3.
-
-    Between counting elements, which leaves the few hexahedra of a mixed mesh to its many
-    tetrahedra, and counting volume, which does the opposite.
-    """
-    ends = kind.ideal[kind.edges]
-    return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1).mean() ** (-kind.dim * _WEIGHT_POWER))
-
-
 def problem(
     mesh: Mesh,
     constraints: Constraints,
@@ -220,13 +208,11 @@ def problem(
     dtype = mesh.points.dtype
     free = jnp.trace(constraints.projectors, axis1=-2, axis2=-1) > 0
     kinds = tuple(kind for kind, _ in mesh.blocks)
-    weights = [
-        type_weight(kind) * gather(free, nodes).any(axis=1).astype(dtype) for kind, nodes in mesh.blocks
-    ]
-    total = jnp.stack([weight.sum() for weight in weights]).sum()
+    movable = [gather(free, nodes).any(axis=1).astype(dtype) for _, nodes in mesh.blocks]
+    total = jnp.concatenate(movable).sum()
     blocks = tuple(
-        _cut(nodes, size, weight / jnp.where(total > 0, total, 1))
-        for (_, nodes), size, weight in zip(mesh.blocks, sizes, weights, strict=True)
+        _cut(nodes, size, part / jnp.where(total > 0, total, 1))
+        for (_, nodes), size, part in zip(mesh.blocks, sizes, movable, strict=True)
     )
     return Problem(
         constraints.projectors, blocks, aggregation, jnp.asarray(size_weight, dtype), kinds, metric

@@ -20,6 +20,7 @@ from jaxsmooth.distortion import (
 from jaxsmooth.elements import element_type, supported
 from jaxsmooth.mesh import Mesh
 from jaxsmooth.methods.optimize import GOALS, Optimize
+from jaxsmooth.metrics import shape_quality
 from jaxsmooth.minimise import Jaxopt, Newton, Optax, Optimistix, regularisation
 from jaxsmooth.objective import Aggregation, problem
 from jaxsmooth.patches import evaluate
@@ -252,3 +253,21 @@ def test_options_are_checked():
         Optimize(goal="best")
     with pytest.raises(ValueError, match="size"):
         Optimize(target="given size")
+
+
+@pytest.mark.parametrize("name", ["wedge", "pyramid"])
+def test_wedges_and_pyramids_see_their_quality_and_their_shape(name):
+    """Flat ones are worse than by their mean ratio alone; tall ones, of less surface, are not better."""
+    kind = element_type(name)
+    heights = jnp.array([0.3, 0.5, 0.8, 1.0, 1.4, 2.0])
+    stretch = jnp.stack([jnp.ones(6), jnp.ones(6), heights], axis=1)
+    nodes = jnp.asarray(kind.ideal) * stretch[:, None]
+    both, mean = (
+        jax.vmap(lambda x, m=metric: inverse_quality(kind, m, 0.0, x, 1.0, 0.0)[0])(nodes)
+        for metric in ("shape", "mean_ratio")
+    )
+    assert (both >= mean - 1e-12).all()
+    assert int(jnp.argmin(both)) == 3
+    excess, gap = 1 / shape_quality(kind, nodes[0]) - 1, (both - mean)[0]
+    assert excess - 0.02 <= gap <= excess  # the kink is rounded
+    assert gap > 0.01

@@ -43,7 +43,7 @@ class Elastic(Method):
     beta: Float[Array, ""] | float = 2.0
     material: Material = Material()
     guard: PatchGuard | None = PatchGuard()
-    tolerance: float = 1e-2
+    tolerance: float = 3e-2
     max_iterations: int = 1000
 
     def propose(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Proposal:

@@ -76,7 +76,7 @@ class Optimize(Method):
     size_weight: Float[Array, ""] | float = 1.0
     pivot: Float[Array, ""] | float = 0.5
     minimiser: Minimiser = Newton()
-    start: Method | None = Elastic()
+    start: Method | None = Elastic(tolerance=0.1)
     start_steps: int = 2
     untangling_steps: int = 10
     guard: PatchGuard | None = PatchGuard(gamma=0.0, poor=0.0)
