@@ -228,8 +228,8 @@ def _constraints(file: MeshFile, options: argparse.Namespace) -> Constraints:
 
     fixed = file.fixed.copy()
     for name in options.fix:
-        if name == "fixed":
-            continue
+        if name == "fixed" and fixed.any():
+            continue  # a file's own mark is heeded anyway
         if name not in file.named_sets:
             near = difflib.get_close_matches(name, file.named_sets, n=2, cutoff=0.4)
             known = ", ".join(file.named_sets) or "none"

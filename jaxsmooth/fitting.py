@@ -117,7 +117,7 @@ def _rotation_3d(h: Matrix) -> Matrix:
 
     columns = tuple(tuple(h[i, j] for i in range(3)) for j in range(3))
     axes = tuple(tuple(jnp.full_like(h[0, 0], i == j) for i in range(3)) for j in range(3))
-    state = columns, axes, angle(*columns[:2]), columns[0]
+    state = columns, axes, angle(*columns[:2]), tuple(dot(c, c) for c in columns)
     columns, axes, _, lengths = jax.lax.fori_loop(0, 3 * _SWEEPS, rotate, state)
 
     def pick(which, triple):
@@ -127,7 +127,7 @@ def _rotation_3d(h: Matrix) -> Matrix:
 
     x, y, z = lengths
     longest = (x >= y) & (x >= z), (y > x) & (y >= z)
-    # of the two others the longer one, in cyclic order
+    # of the two others the longer one
     middle = (
         jnp.where(longest[0], False, jnp.where(longest[1], x > z, x >= y)),
         jnp.where(longest[0], y >= z, jnp.where(longest[1], False, y > x)),

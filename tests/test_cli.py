@@ -124,6 +124,7 @@ BAD = [
     (("smooth", "PART", "out.what"), ".what"),
     (("smooth", "PART", "OUT", "--method", "elastc"), "did you mean elastic"),
     (("smooth", "PART", "OUT", "--fix", "nothing"), "nothing"),
+    (("smooth", "PART", "OUT", "--fix", "fixed"), "unknown set 'fixed'"),
     (("smooth", "PART", "OUT", "--steps", "-1"), "steps"),
     (("smooth", "PART", "OUT", "--json", "nofolder/x.json"), "nofolder"),
     (("quality", "PART", "--metric", "mean_ration"), "did you mean mean_ratio"),

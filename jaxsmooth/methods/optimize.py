@@ -53,8 +53,8 @@ class Optimize(Method):
     Attributes:
         goal: ``"average"``, ``"worst"`` or ``"balanced"``: the best mean quality, the best of
             the poor elements, or both; see `GOALS`.
-        metric: ``"shape"``, the paper's q where its optimum is the ideal element and the mean
-            ratio elsewhere, or ``"mean_ratio"`` for all.
+        metric: ``"shape"``, the paper's q where its optimum is the ideal element, both for
+            wedges and pyramids, the mean ratio for quadratic elements, or ``"mean_ratio"`` for all.
         target: ``"free size"``, ``"own size"`` (the paper's) or ``"given size"``.
         size: for a given size, the measure of the target elements: a number, or one array a block.
         size_weight: how much the size counts beside the shape, unless it is free.
