@@ -6,13 +6,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsmooth.small import determinant, norm, solve_regular
+from jaxsmooth.small import cofactors, determinant, norm, solve_regular
 
 __all__ = ["fit", "rotation", "rotation_svd", "target_element"]
 
 Matrix = Float[Array, "dim dim"]
-_SWEEPS = 5  # of Jacobi rotations; four reach rounding on random matrices
 _AXIAL = ((2, 1), (0, 2), (1, 0))
+_DIAGONAL = (1, 0, 0, 0, 1, 0, 0, 1, 0, 1)  # of an upper triangle, row by row
+_ANYWHERE = (0.787, 0.413, 0.326, 0.321)  # a quaternion that no symmetric mesh has
 
 
 def rotation_svd(moments: Matrix) -> Matrix:
@@ -30,10 +31,10 @@ def rotation_svd(moments: Matrix) -> Matrix:
 def rotation(moments: Matrix) -> Matrix:
     """The same rotation as `rotation_svd`, several times faster, with its own derivative.
 
-    2D: closed form.  3D: one-sided Jacobi rotations make the columns of H orthogonal; the
-    third axis is the cross product of the other two, which holds for inverted and flat
-    elements too.  Where the rotation is not unique (the two least signed singular values sum
-    to zero) one of the minimisers is returned and its derivative is zero.
+    2D: closed form.  3D: the first eigenvector of a symmetric 4×4 matrix, by its characteristic
+    polynomial.  Where the rotation is not unique (the two least signed singular values sum to
+    zero) one of the minimisers is returned and its derivative is zero; where that sum is below
+    about ``√eps`` of the largest, one that is as good to ``√eps``.
     """
     return _rotation_2d(moments) if len(moments) == 2 else _rotation_3d(moments)
 
@@ -83,79 +84,102 @@ def _scaled(h: Matrix) -> Matrix:
 
 
 def _rotation_3d(h: Matrix) -> Matrix:
-    tiny = jnp.finfo(h.dtype).tiny
+    """By unit quaternions (Horn 1987): tr(R H) = qᵀ N q is largest for the first eigenvector of N.
+
+    Everything is written in scalars, which under vmap stay elementwise and fuse.  No branch and no
+    choice is made: the compiler may evaluate one twice, with other rounding.
+    """
     h = _scaled(h)
+    n = _horn(h)
+    m = _adjugate(*(_largest_eigenvalue(h) * d - x for x, d in zip(n, _DIAGONAL, strict=True)))
 
-    # Columns as tuples of scalars: under vmap everything stays elementwise and fuses.
-    def dot(a, b):
-        return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-    def cross(a, b):
-        return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-
-    def angle(a, b):
-        """Cosine and sine of the rotation that makes two columns orthogonal."""
-        gap, overlap = dot(b, b) - dot(a, a), 2 * dot(a, b)
-        root = jnp.abs(gap) + jnp.sqrt(gap * gap + overlap * overlap)
-        tangent = jnp.where(gap >= 0, overlap, -overlap) / (root + tiny)
-        cosine = 1 / jnp.sqrt(1 + tangent * tangent)
-        return cosine, cosine * tangent
-
-    def turn(triple, cosine, sine):
-        """Rotate the first two vectors, then renumber: 0, 1, 2 become 2, 0, 1."""
-        a, b, c = triple
-        first = tuple(cosine * x - sine * y for x, y in zip(a, b, strict=True))
-        return tuple(sine * x + cosine * y for x, y in zip(a, b, strict=True)), c, first
-
-    # The compiler may evaluate an expression once for every result that uses it, each time with
-    # other rounding.  Every decision (the sign of an angle, which column is longest) therefore
-    # depends on numbers that the loop stores: taken twice, it is taken alike.
-    def rotate(_, state):
-        columns, axes, (cosine, sine), _ = state
-        columns, axes = turn(columns, cosine, sine), turn(axes, cosine, sine)
-        return columns, axes, angle(*columns[:2]), tuple(dot(c, c) for c in columns)
-
-    columns = tuple(tuple(h[i, j] for i in range(3)) for j in range(3))
-    axes = tuple(tuple(jnp.full_like(h[0, 0], i == j) for i in range(3)) for j in range(3))
-    state = columns, axes, angle(*columns[:2]), tuple(dot(c, c) for c in columns)
-    columns, axes, _, lengths = jax.lax.fori_loop(0, 3 * _SWEEPS, rotate, state)
-
-    def pick(which, triple):
+    def unit(q):
+        square = sum(x * x for x in q)
+        regular = square > 0
+        scale = 1 / jnp.sqrt(jnp.where(regular, square, 1))
         return tuple(
-            jnp.where(which[0], x, jnp.where(which[1], y, z)) for x, y, z in zip(*triple, strict=True)
+            jnp.where(regular, x * scale, one) for x, one in zip(q, (1.0, 0.0, 0.0, 0.0), strict=True)
         )
 
-    x, y, z = lengths
-    longest = (x >= y) & (x >= z), (y > x) & (y >= z)
-    # of the two others the longer one
-    middle = (
-        jnp.where(longest[0], False, jnp.where(longest[1], x > z, x >= y)),
-        jnp.where(longest[0], y >= z, jnp.where(longest[1], False, y > x)),
+    def apply(_, q):
+        w, x, y, z = q
+        return unit(
+            (
+                m[0] * w + m[1] * x + m[2] * y + m[3] * z,
+                m[1] * w + m[4] * x + m[5] * y + m[6] * z,
+                m[2] * w + m[5] * x + m[7] * y + m[8] * z,
+                m[3] * w + m[6] * x + m[8] * y + m[9] * z,
+            )
+        )
+
+    # The adjugate of λ − N is q qᵀ but for a factor.  Twice more, for a start orthogonal to q.
+    start = tuple(jnp.full_like(h[0, 0], part) for part in _ANYWHERE)
+    w, x, y, z = jax.lax.fori_loop(0, 3, apply, start)
+    rows = (
+        (w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z),
     )
-    long, short = pick(longest, columns), pick(middle, columns)
-    first = _unit_or(long, (1.0, 0.0, 0.0), dot)
-    # a needle has no second direction: any normal to the first one is a minimiser
-    spare = cross(first, _least_axis(long))
-    second = _unit_or(short, _unit_or(spare, (0.0, 1.0, 0.0), dot), dot)
-    u = (first, second, cross(first, second))
-    v = (pick(longest, axes), pick(middle, axes))
-    v = (*v, cross(*v))
-    return jnp.stack(
-        [jnp.stack([sum(v[m][i] * u[m][j] for m in range(3)) for j in range(3)]) for i in range(3)]
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def _horn(h: Matrix) -> tuple[Array, ...]:
+    """Upper triangle of Horn's symmetric matrix N, row by row."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = h
+    return (
+        *(xx + yy + zz, yz - zy, zx - xz, xy - yx),
+        *(xx - yy - zz, xy + yx, zx + xz),
+        *(yy - xx - zz, yz + zy),
+        zz - xx - yy,
     )
 
 
-def _unit_or(vector, fallback, dot):
-    square = dot(vector, vector)
-    regular = square > jnp.finfo(square.dtype).eps ** 3
-    scale = 1 / jnp.sqrt(jnp.where(regular, square, 1))
-    return tuple(jnp.where(regular, x * scale, f) for x, f in zip(vector, fallback, strict=True))
+def _largest_eigenvalue(h: Matrix) -> Array:
+    """Of N: the largest root of ``(λ² − |H|²)² − 8 λ det H − 4 |cof H|²`` (as Theobald 2005).
+
+    Newton's method comes down to it from an upper bound.  Towards a double root it halves the
+    distance, and stops with half of the digits: closer, the adjugate would be all rounding.
+    """
+    cof = cofactors(h)
+    square, det, minors = (h * h).sum(), (h[0] * cof[0]).sum(), (cof * cof).sum()
+    numbers = jnp.finfo(h.dtype)
+
+    def unfinished(state):
+        root, step, count = state
+        return (step > numbers.eps * root) & (count < numbers.nmant // 2)
+
+    def newton(state):
+        root, _, count = state
+        gap = root * root - square
+        value, slope = gap * gap - 8 * det * root - 4 * minors, 4 * root * gap - 8 * det
+        rising = (value > 0) & (slope > 0)
+        step = jnp.where(rising, value / jnp.where(rising, slope, 1), 0)
+        return root - step, step, count + 1
+
+    bound = jnp.sqrt(3 * square)
+    return jax.lax.while_loop(unfinished, newton, (bound, bound, jnp.int32(0)))[0]
 
 
-def _least_axis(a):
-    x, y, z = (jnp.abs(c) for c in a)
-    first, second = (x <= y) & (x <= z), (y < x) & (y <= z)
-    return tuple(m.astype(a[0].dtype) for m in (first, second, ~first & ~second))
+def _adjugate(a00, a01, a02, a03, a11, a12, a13, a22, a23, a33) -> tuple[Array, ...]:
+    """Adjugate of a symmetric 4×4 matrix, upper triangles row by row, from its 2×2 minors."""
+    # of the rows 0 and 1
+    t01, t02, t03 = a00 * a11 - a01 * a01, a00 * a12 - a01 * a02, a00 * a13 - a01 * a03
+    t12, t13, t23 = a01 * a12 - a11 * a02, a01 * a13 - a11 * a03, a02 * a13 - a12 * a03
+    # of the rows 2 and 3
+    b02, b03 = a02 * a23 - a03 * a22, a02 * a33 - a03 * a23
+    b12, b13, b23 = a12 * a23 - a13 * a22, a12 * a33 - a13 * a23, a22 * a33 - a23 * a23
+    return (
+        a11 * b23 - a12 * b13 + a13 * b12,
+        a02 * b13 - a01 * b23 - a03 * b12,
+        a13 * t23 - a23 * t13 + a33 * t12,
+        a22 * t13 - a12 * t23 - a23 * t12,
+        a00 * b23 - a02 * b03 + a03 * b02,
+        a23 * t03 - a03 * t23 - a33 * t02,
+        a02 * t23 - a22 * t03 + a23 * t02,
+        a03 * t13 - a13 * t03 + a33 * t01,
+        a12 * t03 - a02 * t13 - a23 * t01,
+        a02 * t12 - a12 * t02 + a22 * t01,
+    )
 
 
 def fit(
