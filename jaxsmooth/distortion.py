@@ -27,9 +27,12 @@ __all__ = [
     "inverse_quality",
     "model_diagonal",
     "positive_part",
+    "regularisation",
 ]
 
 METRICS = ("shape", "mean_ratio")
+_EPS, _EPS_SLOPE = 0.1, 0.2  # ε of a degenerate mesh, and its growth with the worst inversion
+_KEEP = 4.0  # size weight per ε: with ε, elements that vanish would look better than ideal ones
 _SKEW = 0.5  # weight of the corner term beside the isoperimetric one
 _ROUND = 0.02  # radius of the rounded kink of `_excess`
 
@@ -49,6 +52,16 @@ def positive_part(det: Array, eps: Array | float) -> Array:
     return jnp.where(behind, without_cancellation, (det + root) / 2)
 
 
+def regularisation(worst: Scalar) -> Scalar:
+    """ε for a mesh whose least relative determinant is `worst`.
+
+    Proportional to the worst inversion, so that it falls as the mesh untangles (Garanzha et al.
+    2021).  Valid meshes that are nearly degenerate have some too: without it a Newton step lifts a
+    small determinant by a constant factor only.
+    """
+    return jnp.where(worst > 0, jnp.maximum(_EPS - worst, 0), _EPS - _EPS_SLOPE * worst)
+
+
 def _slope(det: Array, eps: Array | float) -> Array:
     root = jnp.sqrt(det * det + eps * eps)
     return jnp.where(root > 0, (1 + det / jnp.where(root > 0, root, 1)) / 2, 0)
@@ -64,9 +77,9 @@ def isoperimetric(kind: ElementType, metric: str) -> bool:
 
 
 def _bounded(kind: ElementType, metric: str) -> bool:
-    """Whether the paper's q only bounds the metric, which is the mean ratio: for wedges and
-    pyramids, some of which have less surface than the ideal one."""
-    return metric == "shape" and kind.name in ("wedge", "pyramid")
+    """Whether the paper's q only bounds the metric, which is the mean ratio: where some elements
+    have less surface than the ideal one."""
+    return metric == "shape" and not isoperimetric(kind, metric)
 
 
 def _sampled(kind: ElementType, metric: str) -> bool:
@@ -170,6 +183,10 @@ def _samples(
     return (unit * square).sum(), gradient, samples
 
 
+def _size_weight(size_weight: Scalar, eps: Scalar) -> Scalar:
+    return size_weight + _KEEP * eps
+
+
 class _Metric(NamedTuple):
     """e, its gradient, and what the Hessian model needs."""
 
@@ -183,6 +200,7 @@ class _Metric(NamedTuple):
 def _metric(kind: ElementType, metric: str, size_weight, nodes: Nodes, size, eps) -> _Metric:
     dim = kind.dim
     volume = _volume(kind, nodes, size, eps)
+    size_weight = _size_weight(size_weight, eps)
     stretch = volume.value / size
     value = size_weight * ((stretch + 1 / stretch) / 2 - 1)
     gradient = size_weight * (1 - 1 / stretch**2) / (2 * size) * volume.gradient
@@ -214,13 +232,14 @@ def inverse_quality(
     q is blunt about corners, so elements whose Jacobian varies add the excess of the mean over
     the sample points of ``|A|² / (d det(A)^(2/d))``; for quadrilaterals and hexahedra with the
     columns of A normalised, which leaves aspect ratios to q: it is the scaled Jacobian to the
-    power −2/d.  Wedges and pyramids take the mean ratio and the excess of the inverse q over 1.
+    power −2/d.  Wedges, pyramids and quadratic elements take the mean ratio and the excess of the
+    inverse q over 1.
     ``mean_ratio``: the mean over the sample points of ``|A|² / (d det(A)^(2/d))``,
     A the deformation gradient from the ideal element (Knupp 2001).
 
     Args:
         kind: the element type.
-        metric: ``"shape"`` or ``"mean_ratio"``; quadratic elements always take the latter.
+        metric: ``"shape"`` or ``"mean_ratio"``.
         size_weight: of ``(τ + 1/τ)/2 − 1``, τ the measure over the target's; 0 leaves it free.
         nodes: ``[k, dim]``.
         size: measure of the target element.
@@ -265,7 +284,7 @@ def hessian_model(
     volume, surface, samples = found.volume, found.surface, found.samples
     vectors = [
         jnp.sqrt(jnp.maximum(second, 0)) * found.gradient,
-        jnp.sqrt(first * size_weight * size / volume.value**3) * volume.gradient,
+        jnp.sqrt(first * _size_weight(size_weight, eps) * size / volume.value**3) * volume.gradient,
     ]
     facets = None
     if surface is not None:

@@ -14,17 +14,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxsmooth.distortion import regularisation
 from jaxsmooth.objective import Problem
 from jaxsmooth.solve import conjugate_gradients, project
 
-__all__ = ["Jaxopt", "Minimised", "Minimiser", "Newton", "Optax", "Optimistix", "regularisation"]
+__all__ = ["Jaxopt", "Minimised", "Minimiser", "Newton", "Optax", "Optimistix"]
 
 Field = Float[Array, "nodes dim"]
 Scalar = Float[Array, ""]
 
 _SUFFICIENT = 1e-4  # part of the predicted decrease that a step has to bring (Armijo)
 _HALVINGS = 12
-_EPS, _EPS_SLOPE = 0.1, 0.2  # ε of a degenerate mesh, and its growth with the worst inversion
 
 
 class Minimised(NamedTuple):
@@ -33,16 +33,6 @@ class Minimised(NamedTuple):
     points: Field
     value: Scalar
     iterations: Int[Array, ""]
-
-
-def regularisation(worst: Scalar) -> Scalar:
-    """ε for a mesh whose least relative determinant is `worst`.
-
-    Proportional to the worst inversion, so that it falls as the mesh untangles (Garanzha et al.
-    2021).  Valid meshes that are nearly degenerate have some too: without it a Newton step lifts a
-    small determinant by a constant factor only.
-    """
-    return jnp.where(worst > 0, jnp.maximum(_EPS - worst, 0), _EPS - _EPS_SLOPE * worst)
 
 
 class Minimiser(eqx.Module):

@@ -15,10 +15,18 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from jaxsmooth.constraints import Constraints
-from jaxsmooth.distortion import Model, apply_model, hessian_model, inverse_quality, model_diagonal
+from jaxsmooth.distortion import (
+    Model,
+    apply_model,
+    hessian_model,
+    inverse_quality,
+    model_diagonal,
+    regularisation,
+)
 from jaxsmooth.elements import ElementType
 from jaxsmooth.mesh import Mesh, gather
 from jaxsmooth.small import contract, determinant
@@ -61,11 +69,20 @@ class Aggregation(eqx.Module):
 
 
 class Block(eqx.Module):
-    """One element block cut into chunks ``[chunks, size]``; ghosts have weight 0."""
+    """One element block cut into chunks ``[chunks, size]``; ghosts have weight 0.
+
+    Elements that are given up have a `relief`: an ε of their own, so that they may stay inverted.
+    """
 
     nodes: Array
     size: Array
     weight: Array
+    relief: Array
+
+    @property
+    def fields(self) -> tuple[Array, ...]:
+        """What a scan over the chunks takes."""
+        return self.nodes, self.size, self.weight, self.relief
 
 
 class Problem(eqx.Module):
@@ -90,7 +107,7 @@ class Problem(eqx.Module):
                 corners = _whole(kind, chunk.weight, gather(points, chunk.nodes))
                 return function(carry, kind, chunk, corners), None
 
-            start, _ = jax.lax.scan(add, start, (block.nodes, block.size, block.weight))
+            start, _ = jax.lax.scan(add, start, block.fields)
         return start
 
     def inverse_quality(self, points: Field) -> tuple[Float[Array, " elements"], Float[Array, " elements"]]:
@@ -105,18 +122,54 @@ class Problem(eqx.Module):
             jnp.concatenate([part.reshape(-1) for part in side]) for side in zip(*found, strict=True)
         )
 
+    def determinants(self, points: Field) -> tuple[Float[Array, "chunks size"], ...]:
+        """The least determinant of every element over its target's; ∞ for those without weight."""
+
+        def found(kind, block):
+            corners = _whole(kind, block.weight, gather(points, block.nodes))
+            det = jax.vmap(jax.vmap(partial(_least_determinant, kind)))(corners) / block.size
+            return jnp.where(block.weight > 0, det, jnp.inf)
+
+        return tuple(found(kind, block) for kind, block in zip(self.kinds, self.blocks, strict=True))
+
+    def hopeless(self, points: Field) -> tuple[Bool[Array, "chunks size"], ...]:
+        """The elements that stay inverted: a determinant is not positive and all its nodes are held."""
+        free = jnp.trace(self.projectors, axis1=-2, axis2=-1) > 0
+
+        def found(kind, block):
+            reference = jnp.asarray(kind.validity_gradients, points.dtype)
+            depends = np.abs(kind.validity_gradients).max(axis=-1) > 1e-12
+            held = ~(depends & gather(free, block.nodes)[..., None, :]).any(axis=-1)
+            corners = _whole(kind, block.weight, gather(points, block.nodes))
+            det = jax.vmap(jax.vmap(lambda nodes: determinant(contract(nodes, reference))))(corners)
+            return (held & ~(det > 0)).any(axis=-1)
+
+        return tuple(found(kind, block) for kind, block in zip(self.kinds, self.blocks, strict=True))
+
+    def relieved(
+        self,
+        determinants: tuple[Float[Array, "chunks size"], ...],
+        elements: tuple[Bool[Array, "chunks size"], ...],
+    ) -> Problem:
+        """The problem in which these elements are given up."""
+        relief = [
+            jnp.where(out, regularisation(det), 0) for det, out in zip(determinants, elements, strict=True)
+        ]
+        return eqx.tree_at(lambda task: [block.relief for block in task.blocks], self, relief)
+
     def value(self, points: Field, eps: Scalar) -> tuple[Scalar, Scalar]:
         """The objective, and the least determinant over its target's (of weighted elements)."""
 
         def add(carry, kind, block, corners):
-            def element(nodes, size):
-                e, _ = inverse_quality(kind, self.metric, self.size_weight, nodes, size, eps)
-                det = determinant(contract(nodes, jnp.asarray(kind.validity_gradients, nodes.dtype))).min()
-                return self.aggregation(e), det / size
+            def element(nodes, size, relief):
+                eps_here = jnp.maximum(eps, relief)
+                e, _ = inverse_quality(kind, self.metric, self.size_weight, nodes, size, eps_here)
+                return self.aggregation(e), _least_determinant(kind, nodes) / size
 
-            energy, det = jax.vmap(element)(corners, block.size)
+            energy, det = jax.vmap(element)(corners, block.size, block.relief)
             total, worst = carry
-            worst = jnp.minimum(worst, jnp.where(block.weight > 0, det, jnp.inf).min())
+            counts = (block.weight > 0) & (block.relief == 0)
+            worst = jnp.minimum(worst, jnp.where(counts, det, jnp.inf).min())
             return total + block.weight @ energy, worst
 
         return self._scan(add, (jnp.zeros((), points.dtype), jnp.full((), jnp.inf, points.dtype)), points)
@@ -125,11 +178,12 @@ class Problem(eqx.Module):
         """The objective and its gradient, projected onto the free directions."""
 
         def add(carry, kind, block, corners):
-            def element(nodes, size):
-                e, gradient = inverse_quality(kind, self.metric, self.size_weight, nodes, size, eps)
+            def element(nodes, size, relief):
+                eps_here = jnp.maximum(eps, relief)
+                e, gradient = inverse_quality(kind, self.metric, self.size_weight, nodes, size, eps_here)
                 return self.aggregation(e), self.aggregation.derivatives(e)[0] * gradient
 
-            energies, slopes = jax.vmap(element)(corners, block.size)
+            energies, slopes = jax.vmap(element)(corners, block.size, block.relief)
             total, gradient = carry
             slopes = block.weight[:, None, None] * slopes
             gradient = gradient.at[block.nodes].add(slopes, mode="promise_in_bounds")
@@ -146,21 +200,21 @@ class Problem(eqx.Module):
         blocks = jnp.zeros((*points.shape, dim), points.dtype)
         for kind, block in zip(self.kinds, self.blocks, strict=True):
 
-            def element(weight, size, nodes, kind=kind):
+            def element(nodes, size, weight, relief, kind=kind):
                 def aggregate(e):
                     first, second = self.aggregation.derivatives(e)
                     return weight * first, weight * second
 
-                nodes = _whole(kind, weight, nodes)
-                model = hessian_model(kind, self.metric, self.size_weight, aggregate, nodes, size, eps)
+                nodes, eps_here = _whole(kind, weight, nodes), jnp.maximum(eps, relief)
+                model = hessian_model(kind, self.metric, self.size_weight, aggregate, nodes, size, eps_here)
                 return model, model_diagonal(kind, model)
 
             def add(total, chunk, element=element):
-                nodes, size, weight = chunk
-                model, diagonal = jax.vmap(element)(weight, size, gather(points, nodes))
+                nodes, *rest = chunk
+                model, diagonal = jax.vmap(element)(gather(points, nodes), *rest)
                 return total.at[nodes].add(diagonal, mode="promise_in_bounds"), model
 
-            blocks, model = jax.lax.scan(add, blocks, (block.nodes, block.size, block.weight))
+            blocks, model = jax.lax.scan(add, blocks, block.fields)
             models.append(model)
         rest = jnp.eye(dim, dtype=points.dtype) - self.projectors
         scale = jnp.trace(blocks, axis1=-2, axis2=-1)[:, None, None]
@@ -179,6 +233,10 @@ class Problem(eqx.Module):
 
             total, _ = jax.lax.scan(add, total, (block.nodes, model))
         return project(self.projectors, total)
+
+
+def _least_determinant(kind: ElementType, nodes: Array) -> Scalar:
+    return determinant(contract(nodes, jnp.asarray(kind.validity_gradients, nodes.dtype))).min()
 
 
 def _whole(kind: ElementType, weight: Array, nodes: Array) -> Array:
@@ -229,4 +287,4 @@ def _cut(nodes: Array, size: Array, weight: Array) -> Block:
         padded = jnp.pad(array, padding, constant_values=filling)
         return padded.reshape(chunks, length, *array.shape[1:])
 
-    return Block(fold(nodes, 0), fold(size, 1), fold(weight, 0))
+    return Block(fold(nodes, 0), fold(size, 1), fold(weight, 0), fold(jnp.zeros_like(size), 0))

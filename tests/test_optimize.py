@@ -16,12 +16,13 @@ from jaxsmooth.distortion import (
     inverse_quality,
     model_diagonal,
     positive_part,
+    regularisation,
 )
 from jaxsmooth.elements import element_type, supported
 from jaxsmooth.mesh import Mesh
 from jaxsmooth.methods.optimize import GOALS, Optimize
 from jaxsmooth.metrics import shape_quality
-from jaxsmooth.minimise import Jaxopt, Newton, Optax, Optimistix, regularisation
+from jaxsmooth.minimise import Jaxopt, Newton, Optax, Optimistix
 from jaxsmooth.objective import Aggregation, problem
 from jaxsmooth.patches import evaluate
 
@@ -64,7 +65,7 @@ def least(mesh):
 
 
 KINDS = supported()
-# "shape" means the mean ratio for all types but these
+# types for which "shape" is not, or not only, the mean ratio
 PAIRS = [(name, "shape") for name in KINDS] + [
     (name, "mean_ratio") for name in ("triangle", "quad", "tetra", "hexahedron")
 ]
@@ -148,6 +149,17 @@ def test_positive_part():
     assert regularisation(jnp.float64(-1.0)) > 0.1
 
 
+@pytest.mark.parametrize("name", ["triangle", "hexahedron", "wedge", "tetra10"])
+def test_vanishing_elements_are_no_way_out(name):
+    """With a regularised determinant alone, a metric without size falls to zero with the element."""
+    kind = element_type(name)
+    for eps in (0.01, 0.1, 0.5):
+        scaled = [
+            inverse_quality(kind, "shape", 0.0, s * jnp.asarray(kind.ideal), 1.0, eps)[0] for s in (1, 1e-3)
+        ]
+        assert scaled[1] > scaled[0] + 0.5
+
+
 def test_problem_gradient_and_value():
     mesh, held = square()
     sizes = (jnp.full(64, 1 / 64),)
@@ -207,6 +219,36 @@ def test_held_inverted_elements_do_no_harm():
     np.testing.assert_array_equal(run(mesh, everything).points, mesh.points)
 
 
+def test_an_element_that_stays_inverted_does_not_stop_the_others():
+    mesh, held = square()
+    points = np.asarray(mesh.points).copy()
+    points[0] = 0.1  # the first quadrilateral is concave there, and its three nodes are held
+    mesh = mesh.with_points(jnp.asarray(points))
+    constraints = Constraints.hold(mesh, held)
+    task = problem(mesh, constraints, (jnp.full(64, 1 / 64),), Aggregation(1.0, 1.0, 4.0))
+    np.testing.assert_array_equal(np.flatnonzero(task.hopeless(mesh.points)[0]), [0])
+    q, det = (np.asarray(part[0]) for part in evaluate(run(mesh, held)))
+    assert (det[1:] > 0).all()
+    assert q[1:].mean() > 0.97
+
+
+def test_given_up_elements_stay_finite_and_leave_the_others_alone():
+    mesh, held = square(amplitude=1.6, seed=3)
+    task = problem(mesh, Constraints.hold(mesh, held), (jnp.full(64, 1 / 64),), Aggregation(1.0, 1.0, 4.0))
+    dets = task.determinants(mesh.points)
+    inverted = tuple(det <= 0 for det in dets)
+    relieved = task.relieved(dets, inverted)
+    value, worst = relieved.value(mesh.points, jnp.float64(0.0))
+    assert inverted[0].any()
+    assert jnp.isfinite(value)
+    np.testing.assert_allclose(worst, dets[0][~inverted[0]].min(), rtol=1e-12)
+    none = task.relieved(dets, tuple(jnp.zeros_like(part) for part in inverted))
+    assert not none.blocks[0].relief.any()
+    found = Newton()(relieved, mesh.points)
+    assert found.value < value
+    assert (task.determinants(found.points)[0][~inverted[0]] > 0).all()
+
+
 def test_no_element_is_inverted_that_was_not():
     for seed in range(3):
         mesh, held = square(amplitude=2.5, seed=seed)
@@ -255,8 +297,8 @@ def test_options_are_checked():
         Optimize(target="given size")
 
 
-@pytest.mark.parametrize("name", ["wedge", "pyramid"])
-def test_wedges_and_pyramids_see_their_quality_and_their_shape(name):
+@pytest.mark.parametrize("name", ["wedge", "pyramid", "tetra10", "hexahedron20"])
+def test_quality_and_shape_are_both_seen(name):
     """Flat ones are worse than by their mean ratio alone; tall ones, of less surface, are not better."""
     kind = element_type(name)
     heights = jnp.array([0.3, 0.5, 0.8, 1.0, 1.4, 2.0])

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxsmooth.constraints import Constraints
 from jaxsmooth.distortion import METRICS
@@ -16,7 +16,7 @@ from jaxsmooth.methods.base import Method, Proposal
 from jaxsmooth.methods.elastic import Elastic, target_measures
 from jaxsmooth.minimise import Minimised, Minimiser, Newton
 from jaxsmooth.objective import Aggregation, Problem, problem
-from jaxsmooth.patches import Evaluation, PatchGuard
+from jaxsmooth.patches import Evaluation, PatchGuard, evaluate
 
 __all__ = ["GOALS", "Optimize", "Stage"]
 
@@ -26,25 +26,36 @@ TARGETS = ("free size", "own size", "given size")
 class Stage(NamedTuple):
     """One minimisation: weights of the average and of the worst elements, and the power of the latter.
 
-    `tangled` stages are left out when the mesh is valid.
+    One that is `untangling` is left out when the mesh is valid.
     """
 
     average: float
     worst: float
     power: float
-    tangled: bool = False
+    untangling: bool = False
 
 
+_VALID = PatchGuard(gamma=0.0, poor=0.0)  # only against inversion
+_PATIENCE = 4  # untangling stages without success
 _UNTANGLE = Stage(0, 1, 2, True)  # unlike the mean of 1 − q, it grows without bound towards inversion
 # What a user wants, as minimisations one after another (see `Aggregation`).
 GOALS: dict[str, tuple[Stage, ...]] = {
     # the mean of 1 − q, with a light hand on the worst elements
-    "average": (_UNTANGLE, Stage(1, 0.1, 4)),
+    "average": (Stage(1, 0.1, 4),),
     # a p-norm of 1/q that comes ever closer to the maximum
-    "worst": (_UNTANGLE, Stage(0, 1, 4), Stage(0, 1, 8), Stage(0, 1, 16)),
+    "worst": (Stage(0, 1, 4), Stage(0, 1, 8), Stage(0, 1, 16)),
     # the mean of 1 − q, and a penalty on what is worse than the pivot
-    "balanced": (_UNTANGLE, Stage(1, 1, 4), Stage(1, 1, 12)),
+    "balanced": (Stage(1, 1, 4), Stage(1, 1, 12)),
 }
+
+
+class _State(NamedTuple):
+    """Between stages: `fewest` inverted elements so far, and the stages `waited` for fewer."""
+
+    points: Float[Array, "nodes dim"]
+    iterations: Int[Array, ""]
+    fewest: Float[Array, ""]
+    waited: Int[Array, ""]
 
 
 class Optimize(Method):
@@ -53,8 +64,8 @@ class Optimize(Method):
     Attributes:
         goal: ``"average"``, ``"worst"`` or ``"balanced"``: the best mean quality, the best of
             the poor elements, or both; see `GOALS`.
-        metric: ``"shape"``, the paper's q where its optimum is the ideal element, both for
-            wedges and pyramids, the mean ratio for quadratic elements, or ``"mean_ratio"`` for all.
+        metric: ``"shape"``, the paper's q where its optimum is the ideal element, both for wedges,
+            pyramids and quadratic elements, or ``"mean_ratio"`` for all.
         target: ``"free size"``, ``"own size"`` (the paper's) or ``"given size"``.
         size: for a given size, the measure of the target elements: a number, or one array a block.
         size_weight: how much the size counts beside the shape, unless it is free.
@@ -64,6 +75,8 @@ class Optimize(Method):
         start: the method that makes the first steps, or None.
         start_steps: their number.
         untangling_steps: their number while elements are inverted.
+        untangling_stages: bound on the minimisations that follow while elements are inverted; they end
+            earlier when several of them have not made the inverted elements fewer.
         guard: refuses moves that invert an element.
 
     A step is a whole optimisation; another one goes on from there.  It is not differentiable in reverse mode.
@@ -79,7 +92,8 @@ class Optimize(Method):
     start: Method | None = Elastic(tolerance=0.1)
     start_steps: int = 2
     untangling_steps: int = 10
-    guard: PatchGuard | None = PatchGuard(gamma=0.0, poor=0.0)
+    untangling_stages: int = eqx.field(static=True, default=20)
+    guard: PatchGuard | None = _VALID
 
     def __check_init__(self):
         for name, known in (("goal", GOALS), ("metric", METRICS), ("target", TARGETS)):
@@ -92,33 +106,48 @@ class Optimize(Method):
         """The displacement to the optimised mesh."""
         mesh, constraints = jax.lax.stop_gradient((mesh, constraints))
         sizes = self._sizes(mesh)
-        stages = jax.tree.map(lambda *values: jnp.stack([jnp.asarray(v) for v in values]), *GOALS[self.goal])
+        stages = (_UNTANGLE,) * self.untangling_stages + GOALS[self.goal]
+        stages = jax.tree.map(lambda *values: jnp.stack([jnp.asarray(v) for v in values]), *stages)
+        zero = jnp.zeros((), mesh.points.dtype)
 
         def task_of(stage, points):
             aggregation = Aggregation(*(jnp.asarray(value, points.dtype) for value in stage[:3]))
             task = self._problem(mesh, constraints, sizes, aggregation)
             return eqx.tree_at(lambda t: t.aggregation.pivot, task, self._pivot(task, points))
 
-        zero = jnp.zeros((), mesh.points.dtype)
         last = task_of(jax.tree.map(lambda values: values[-1], stages), mesh.points)
+        hopeless = last.hopeless(mesh.points)
         # the start is for meshes that it helps: an optimised one goes on where it is
         value, worst = last.value(mesh.points, zero)
         begun = self._begin(mesh, constraints, before)
         helped = (last.value(begun, zero)[0] < value) | (worst <= 0)
-        points = jnp.where(helped, begun, mesh.points)
+        start = mesh.with_points(jnp.where(helped, begun, mesh.points))
 
-        def run(carry, stage):
-            points, count = carry
-            task = task_of(stage, points)
-            valid = task.value(points, zero)[1] > 0
-            still = Minimised(points, zero, jnp.int32(0))
-            found = jax.lax.cond(stage.tangled & valid, lambda: still, lambda: self.minimiser(task, points))
-            return (found.points, count + found.iterations), None
+        def guarded(points):
+            return _VALID(start, points - start.points, evaluate(start)).points
 
-        (points, count), _ = jax.lax.scan(run, (points, jnp.int32(0)), stages)
-        finite = jnp.isfinite(points).all()
-        move = jnp.where(finite, points - mesh.points, 0)
-        return Proposal(move, count, zero)
+        def run(state, numbered):
+            index, stage = numbered
+            task = task_of(stage, state.points)
+            dets = task.determinants(state.points)
+            tangled = [(det <= 0) & ~out for det, out in zip(dets, hopeless, strict=True)]
+            inverted = sum(part.sum(dtype=zero.dtype) for part in tangled)
+            waited = jnp.where(inverted < state.fewest, 0, state.waited + 1)
+            # what is not to be untangled, or no longer, must not stop the others
+            wanted = [stage.untangling & part for part in tangled]
+            task = task.relieved(dets, [(det <= 0) & ~part for det, part in zip(dets, wanted, strict=True)])
+            idle = stage.untangling & ((inverted == 0) | (waited > _PATIENCE))
+            still = Minimised(state.points, zero, jnp.int32(0))
+            found = jax.lax.cond(idle, lambda: still, lambda: self.minimiser(task, state.points))
+            untangled = index == self.untangling_stages - 1
+            points = jax.lax.cond(untangled, guarded, lambda points: points, found.points)
+            fewest = jnp.minimum(state.fewest, inverted)
+            return _State(points, state.iterations + found.iterations, fewest, waited), None
+
+        first = _State(start.points, jnp.int32(0), jnp.full_like(zero, jnp.inf), jnp.int32(0))
+        end, _ = jax.lax.scan(run, first, (jnp.arange(len(stages.power)), stages))
+        finite = jnp.isfinite(end.points).all()
+        return Proposal(jnp.where(finite, end.points - mesh.points, 0), end.iterations, zero)
 
     def _begin(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Float[Array, "nodes dim"]:
         """The points after the steps of the starting method."""
