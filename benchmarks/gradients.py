@@ -4,12 +4,15 @@
 
 Prints ratios taken in one process: value and gradient of a three-step run over the value alone
 (at the same solver tolerance), temporary memory of 20 steps over that of one, and the
-throughput of `jax.vmap` over 64 small meshes against a loop over jitted single runs.
+throughput of `jax.vmap` over 64 small meshes against a loop over jitted single runs: on one
+device, and spread over as many CPU devices as there are cores, for one call of `jax.vmap` hardly
+uses more than one.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import time
 
 import jax
@@ -68,6 +71,7 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=17)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_num_cpu_devices", os.cpu_count())
     import jaxsmooth as js
     from jaxsmooth.solve import gradient_tolerance
 
@@ -97,7 +101,14 @@ def main() -> None:
         f"ratio {memory[20] / memory[1]:.2f}"
     )
 
-    for kind, make, cells in (("triangle", square, 3), ("triangle", square, 5), ("tetra", cube, 2)):
+    small_meshes = (
+        ("triangle", square, 2),
+        ("triangle", square, 3),
+        ("tetra", cube, 1),
+        ("triangle", square, 5),
+        ("tetra", cube, 2),
+    )
+    for kind, make, cells in small_meshes:
         points, nodes = make(cells)
         small = js.Mesh(points, {kind: nodes})
         sliding = js.detect_constraints(small)
@@ -112,14 +123,22 @@ def small_run(js, mesh, constraints):
 
 
 def compare_batch(name: str, function, batch: np.ndarray) -> None:
-    """One line: a loop over jitted single runs against one vmapped call."""
+    """One line: a loop over jitted single runs against one vmapped call, on one device and on all."""
     single, many = jax.jit(function), jax.jit(jax.vmap(function))
-    loop = seconds(lambda points: [single(p) for p in points], batch)
-    vmapped = seconds(many, batch)
+    devices = jax.make_mesh((jax.device_count(),), ("batch",))
+    part = jax.sharding.PartitionSpec("batch")
+    specs = {"mesh": devices, "in_specs": part, "out_specs": part, "check_vma": False}
+    spread = jax.jit(jax.shard_map(jax.vmap(function), **specs))
+    placed = jax.device_put(batch, jax.NamedSharding(devices, part))
+    loop = seconds(lambda points: [single(p) for p in points], batch, repeats=15)
+    waiting = seconds(lambda points: [jax.block_until_ready(single(p)) for p in points], batch, repeats=15)
+    one, all_ = (seconds(f, points, repeats=15) for f, points in ((many, batch), (spread, placed)))
     once = single._cache_size() == many._cache_size() == 1
     print(
-        f"64 meshes of {name}: loop {loop * 1e3:.1f} ms, vmap {vmapped * 1e3:.1f} ms, "
-        f"throughput × {loop / vmapped:.1f}; compiled once each: {once}"
+        f"64 × {name}: loop {loop * 1e3:.1f} ms, waiting for each {waiting * 1e3:.1f} ms, "
+        f"vmap {one * 1e3:.1f} ms, on {jax.device_count()} devices {all_ * 1e3:.1f} ms; throughput "
+        f"× {loop / one:.1f} and × {loop / all_:.1f}; compiled once each: {once}",
+        flush=True,
     )
 
 
