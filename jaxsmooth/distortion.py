@@ -32,7 +32,7 @@ __all__ = [
 
 METRICS = ("shape", "mean_ratio")
 _EPS, _EPS_SLOPE = 0.1, 0.2  # ε of a degenerate mesh, and its growth with the worst inversion
-_KEEP = 4.0  # size weight per ε: with ε, elements that vanish would look better than ideal ones
+_KEEP = 4.0  # size weight per ε of elements below their size
 _SKEW = 0.5  # weight of the corner term beside the isoperimetric one
 _ROUND = 0.02  # radius of the rounded kink of `_excess`
 
@@ -183,8 +183,9 @@ def _samples(
     return (unit * square).sum(), gradient, samples
 
 
-def _size_weight(size_weight: Scalar, eps: Scalar) -> Scalar:
-    return size_weight + _KEEP * eps
+def _size_weight(size_weight: Scalar, eps: Scalar, stretch: Scalar) -> Scalar:
+    """With ε, metrics without size would be best for elements that vanish."""
+    return size_weight + jnp.where(stretch < 1, _KEEP * eps, 0)
 
 
 class _Metric(NamedTuple):
@@ -200,8 +201,8 @@ class _Metric(NamedTuple):
 def _metric(kind: ElementType, metric: str, size_weight, nodes: Nodes, size, eps) -> _Metric:
     dim = kind.dim
     volume = _volume(kind, nodes, size, eps)
-    size_weight = _size_weight(size_weight, eps)
     stretch = volume.value / size
+    size_weight = _size_weight(size_weight, eps, stretch)
     value = size_weight * ((stretch + 1 / stretch) / 2 - 1)
     gradient = size_weight * (1 - 1 / stretch**2) / (2 * size) * volume.gradient
     surface = samples = None
@@ -240,7 +241,8 @@ def inverse_quality(
     Args:
         kind: the element type.
         metric: ``"shape"`` or ``"mean_ratio"``.
-        size_weight: of ``(τ + 1/τ)/2 − 1``, τ the measure over the target's; 0 leaves it free.
+        size_weight: of ``(τ + 1/τ)/2 − 1``, τ the measure over the target's; 0 leaves it free, but
+            with ε elements below their size are kept from vanishing.
         nodes: ``[k, dim]``.
         size: measure of the target element.
         eps: ε of the regularised determinant, relative to `size`.
@@ -284,7 +286,8 @@ def hessian_model(
     volume, surface, samples = found.volume, found.surface, found.samples
     vectors = [
         jnp.sqrt(jnp.maximum(second, 0)) * found.gradient,
-        jnp.sqrt(first * _size_weight(size_weight, eps) * size / volume.value**3) * volume.gradient,
+        jnp.sqrt(first * _size_weight(size_weight, eps, volume.value / size) * size / volume.value**3)
+        * volume.gradient,
     ]
     facets = None
     if surface is not None:
