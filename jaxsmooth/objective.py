@@ -146,14 +146,17 @@ class Problem(eqx.Module):
 
         return tuple(found(kind, block) for kind, block in zip(self.kinds, self.blocks, strict=True))
 
-    def relieved(
-        self,
-        determinants: tuple[Float[Array, "chunks size"], ...],
-        elements: tuple[Bool[Array, "chunks size"], ...],
-    ) -> Problem:
-        """The problem in which these elements are given up."""
+    def inverted(self, points: Field, but: tuple[Bool[Array, "chunks size"], ...]) -> Scalar:
+        """The number of inverted elements, but for some."""
+        dets = self.determinants(points)
+        return sum(((det <= 0) & ~out).sum(dtype=det.dtype) for det, out in zip(dets, but, strict=True))
+
+    def giving_up(self, points: Field, elements: tuple[Bool[Array, "chunks size"], ...]) -> Problem:
+        """The problem in which those of the elements that are inverted do not stop the others."""
+        dets = self.determinants(points)
         relief = [
-            jnp.where(out, regularisation(det), 0) for det, out in zip(determinants, elements, strict=True)
+            jnp.where((det <= 0) & out, regularisation(det), 0)
+            for det, out in zip(dets, elements, strict=True)
         ]
         return eqx.tree_at(lambda task: [block.relief for block in task.blocks], self, relief)
 

@@ -237,13 +237,15 @@ def test_given_up_elements_stay_finite_and_leave_the_others_alone():
     task = problem(mesh, Constraints.hold(mesh, held), (jnp.full(64, 1 / 64),), Aggregation(1.0, 1.0, 4.0))
     dets = task.determinants(mesh.points)
     inverted = tuple(det <= 0 for det in dets)
-    relieved = task.relieved(dets, inverted)
+    everything = tuple(jnp.ones_like(part) for part in inverted)
+    relieved = task.giving_up(mesh.points, everything)
     value, worst = relieved.value(mesh.points, jnp.float64(0.0))
     assert inverted[0].any()
     assert jnp.isfinite(value)
     np.testing.assert_allclose(worst, dets[0][~inverted[0]].min(), rtol=1e-12)
-    none = task.relieved(dets, tuple(jnp.zeros_like(part) for part in inverted))
-    assert not none.blocks[0].relief.any()
+    np.testing.assert_array_equal(relieved.blocks[0].relief > 0, inverted[0])
+    assert task.inverted(mesh.points, inverted) == 0
+    assert task.inverted(mesh.points, tuple(~part for part in inverted)) == inverted[0].sum()
     found = Newton()(relieved, mesh.points)
     assert found.value < value
     assert (task.determinants(found.points)[0][~inverted[0]] > 0).all()

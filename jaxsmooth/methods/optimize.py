@@ -14,7 +14,7 @@ from jaxsmooth.distortion import METRICS
 from jaxsmooth.mesh import Mesh
 from jaxsmooth.methods.base import Method, Proposal
 from jaxsmooth.methods.elastic import Elastic, target_measures
-from jaxsmooth.minimise import Minimised, Minimiser, Newton
+from jaxsmooth.minimise import Minimiser, Newton
 from jaxsmooth.objective import Aggregation, Problem, problem
 from jaxsmooth.patches import Evaluation, PatchGuard, evaluate
 
@@ -45,7 +45,7 @@ GOALS: dict[str, tuple[Stage, ...]] = {
     # a p-norm of 1/q that comes ever closer to the maximum
     "worst": (Stage(0, 1, 4), Stage(0, 1, 8), Stage(0, 1, 16)),
     # the mean of 1 − q, and a penalty on what is worse than the pivot
-    "balanced": (Stage(1, 1, 4), Stage(1, 1, 12)),
+    "balanced": (Stage(1, 1, 4), Stage(1, 2, 12)),
 }
 
 
@@ -123,28 +123,28 @@ class Optimize(Method):
         helped = (last.value(begun, zero)[0] < value) | (worst <= 0)
         start = mesh.with_points(jnp.where(helped, begun, mesh.points))
 
+        def minimise(state, stage):
+            give_up = tuple(out | ~stage.untangling for out in hopeless)
+            task = task_of(stage, state.points).giving_up(state.points, give_up)
+            found = self.minimiser(task, state.points)
+            inverted = task.inverted(found.points, hopeless)
+            waited = jnp.where(inverted < state.fewest, 0, state.waited + 1)
+            iterations = state.iterations + found.iterations
+            return _State(found.points, iterations, jnp.minimum(inverted, state.fewest), waited)
+
         def guarded(points):
             return _VALID(start, points - start.points, evaluate(start)).points
 
         def run(state, numbered):
             index, stage = numbered
-            task = task_of(stage, state.points)
-            dets = task.determinants(state.points)
-            tangled = [(det <= 0) & ~out for det, out in zip(dets, hopeless, strict=True)]
-            inverted = sum(part.sum(dtype=zero.dtype) for part in tangled)
-            waited = jnp.where(inverted < state.fewest, 0, state.waited + 1)
-            # what is not to be untangled, or no longer, must not stop the others
-            wanted = [stage.untangling & part for part in tangled]
-            task = task.relieved(dets, [(det <= 0) & ~part for det, part in zip(dets, wanted, strict=True)])
-            idle = stage.untangling & ((inverted == 0) | (waited > _PATIENCE))
-            still = Minimised(state.points, zero, jnp.int32(0))
-            found = jax.lax.cond(idle, lambda: still, lambda: self.minimiser(task, state.points))
-            untangled = index == self.untangling_stages - 1
-            points = jax.lax.cond(untangled, guarded, lambda points: points, found.points)
-            fewest = jnp.minimum(state.fewest, inverted)
-            return _State(points, state.iterations + found.iterations, fewest, waited), None
+            idle = stage.untangling & ((state.fewest == 0) | (state.waited > _PATIENCE))
+            state = jax.lax.cond(idle, lambda state, _: state, minimise, state, stage)
+            untangled = (index == self.untangling_stages - 1) & (tangled > 0)
+            points = jax.lax.cond(untangled, guarded, lambda points: points, state.points)
+            return state._replace(points=points), None
 
-        first = _State(start.points, jnp.int32(0), jnp.full_like(zero, jnp.inf), jnp.int32(0))
+        tangled = last.inverted(start.points, hopeless)
+        first = _State(start.points, jnp.int32(0), tangled, jnp.int32(0))
         end, _ = jax.lax.scan(run, first, (jnp.arange(len(stages.power)), stages))
         finite = jnp.isfinite(end.points).all()
         return Proposal(jnp.where(finite, end.points - mesh.points, 0), end.iterations, zero)
