@@ -132,12 +132,12 @@ def compare_batch(name: str, function, batch: np.ndarray) -> None:
     placed = jax.device_put(batch, jax.NamedSharding(devices, part))
     loop = seconds(lambda points: [single(p) for p in points], batch, repeats=15)
     waiting = seconds(lambda points: [jax.block_until_ready(single(p)) for p in points], batch, repeats=15)
-    one, all_ = (seconds(f, points, repeats=15) for f, points in ((many, batch), (spread, placed)))
+    one, every = (seconds(f, points, repeats=15) for f, points in ((many, batch), (spread, placed)))
     once = single._cache_size() == many._cache_size() == 1
     print(
         f"64 × {name}: loop {loop * 1e3:.1f} ms, waiting for each {waiting * 1e3:.1f} ms, "
-        f"vmap {one * 1e3:.1f} ms, on {jax.device_count()} devices {all_ * 1e3:.1f} ms; throughput "
-        f"× {loop / one:.1f} and × {loop / all_:.1f}; compiled once each: {once}",
+        f"vmap {one * 1e3:.1f} ms, on {jax.device_count()} devices {every * 1e3:.1f} ms; throughput "
+        f"× {loop / one:.1f} and × {loop / every:.1f}; compiled once each: {once}",
         flush=True,
     )
 

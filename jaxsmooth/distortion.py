@@ -206,7 +206,7 @@ def _metric(kind: ElementType, metric: str, size_weight, nodes: Nodes, size, eps
     value = size_weight * ((stretch + 1 / stretch) / 2 - 1)
     gradient = size_weight * (1 - 1 / stretch**2) / (2 * size) * volume.gradient
     surface = samples = None
-    if isoperimetric(kind, metric) or _bounded(kind, metric):
+    if metric == "shape":
         surface = _surface(kind, nodes)
         ratio = (surface.value / kind.ideal_surface) ** 2 / volume.value ** (2 * (dim - 1) / dim)
         slope = (

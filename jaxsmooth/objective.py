@@ -138,7 +138,7 @@ class Problem(eqx.Module):
 
         def found(kind, block):
             reference = jnp.asarray(kind.validity_gradients, points.dtype)
-            depends = np.abs(kind.validity_gradients).max(axis=-1) > 1e-12
+            depends = np.abs(kind.validity_gradients).max(axis=-1) > 1e-12  # zero but for rounding
             held = ~(depends & gather(free, block.nodes)[..., None, :]).any(axis=-1)
             corners = _whole(kind, block.weight, gather(points, block.nodes))
             det = jax.vmap(jax.vmap(lambda nodes: determinant(contract(nodes, reference))))(corners)
