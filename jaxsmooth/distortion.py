@@ -53,13 +53,13 @@ def positive_part(det: Array, eps: Array | float) -> Array:
 
 
 def regularisation(worst: Scalar) -> Scalar:
-    """ε for a mesh whose least relative determinant is `worst`.
+    """ε for a mesh whose least relative determinant is `worst`: none for a valid one.
 
     Proportional to the worst inversion, so that it falls as the mesh untangles (Garanzha et al.
-    2021).  Valid meshes that are nearly degenerate have some too: without it a Newton step lifts a
-    small determinant by a constant factor only.
+    2021).  A valid mesh keeps its barrier, however small its determinants: they may be small
+    because elements have shrunk to a better shape.
     """
-    return jnp.where(worst > 0, jnp.maximum(_EPS - worst, 0), _EPS - _EPS_SLOPE * worst)
+    return jnp.where(worst > 0, 0, _EPS - _EPS_SLOPE * worst)
 
 
 def _slope(det: Array, eps: Array | float) -> Array:

@@ -145,7 +145,7 @@ def test_positive_part():
     np.testing.assert_array_equal(positive_part(det, 0.0), jnp.maximum(det, 0))
     slope = jax.vmap(jax.grad(positive_part), in_axes=(0, None))(det, 0.1)
     assert ((slope > 0) & (slope < 1)).all()
-    assert regularisation(jnp.float64(0.1)) == 0
+    assert regularisation(jnp.float64(1e-9)) == 0  # valid, so the barrier stands
     assert regularisation(jnp.float64(-1.0)) > 0.1
 
 
@@ -201,6 +201,29 @@ def test_goals_do_what_they_say():
     assert min(q.mean() for q in found.values()) > before.mean()
     assert found["worst"].min() >= found["average"].min()
     assert found["average"].mean() >= found["worst"].mean()
+
+
+def test_balanced_repairs_what_it_made_worse():
+    mesh, held = square(amplitude=0, triangles=True)
+    x, y = np.asarray(mesh.points).T
+    mesh = mesh.with_points(jnp.asarray(np.stack([4 * x + 0.3 * np.sin(12 * x), y], axis=1)))
+    before, after = least(mesh)[0], least(run(mesh, held))[0]
+    without = least(run(mesh, held, Optimize(goal="average")))[0]
+    assert without < 0.9 * before
+    assert after > before
+
+
+def test_elements_that_have_shrunk_keep_their_barrier():
+    """Elements far smaller than at the start are no reason to regularise their determinants."""
+    mesh, held = square(amplitude=0)
+    x, y = np.asarray(mesh.points).T
+    mesh = mesh.with_points(jnp.asarray(np.stack([x**3, y + 0.3 * x**2], axis=1)))
+    qualities = [least(mesh)[0]]
+    for _ in range(3):
+        mesh = run(mesh, held)
+        qualities.append(least(mesh)[0])
+    assert qualities[1] > 5 * qualities[0]
+    assert min(qualities[2:]) > 0.99 * qualities[1]
 
 
 def test_jiggled_grid_becomes_regular():

@@ -26,26 +26,30 @@ TARGETS = ("free size", "own size", "given size")
 class Stage(NamedTuple):
     """One minimisation: weights of the average and of the worst elements, and the power of the latter.
 
-    One that is `untangling` is left out when the mesh is valid.
+    One that is `untangling` is left out when the mesh is valid, one that is `repairing` unless the worst
+    element is worse than at the start; that element is then the pivot.
     """
 
     average: float
     worst: float
     power: float
     untangling: bool = False
+    repairing: bool = False
 
 
 _VALID = PatchGuard(gamma=0.0, poor=0.0)  # only against inversion
 _PATIENCE = 4  # untangling stages without success
-_UNTANGLE = Stage(0, 1, 2, True)  # unlike the mean of 1 − q, it grows without bound towards inversion
+_UNTANGLE = Stage(0, 1, 2, untangling=True)  # unlike the mean of 1 − q, it grows without bound
+_REPAIR = Stage(1, 30, 32, repairing=True)
+_SLACK = 1.0002  # a rise of the largest e that needs no repair
 # What a user wants, as minimisations one after another (see `Aggregation`).
 GOALS: dict[str, tuple[Stage, ...]] = {
     # the mean of 1 − q, with a light hand on the worst elements
     "average": (Stage(1, 0.1, 4),),
     # a p-norm of 1/q that comes ever closer to the maximum
     "worst": (Stage(0, 1, 4), Stage(0, 1, 8), Stage(0, 1, 16)),
-    # the mean of 1 − q, and a penalty on what is worse than the pivot
-    "balanced": (Stage(1, 1, 4), Stage(1, 2, 12)),
+    # the mean of 1 − q, and a penalty on what is worse than the pivot, then than the worst at the start
+    "balanced": (Stage(1, 1, 4), Stage(1, 0.3, 16), _REPAIR),
 }
 
 
@@ -115,17 +119,20 @@ class Optimize(Method):
             task = self._problem(mesh, constraints, sizes, aggregation)
             return eqx.tree_at(lambda t: t.aggregation.pivot, task, self._pivot(task, points))
 
-        last = task_of(jax.tree.map(lambda values: values[-1], stages), mesh.points)
-        hopeless = last.hopeless(mesh.points)
+        judge = task_of(next(s for s in reversed(GOALS[self.goal]) if not s.repairing), mesh.points)
+        hopeless = judge.hopeless(mesh.points)
         # the start is for meshes that it helps: an optimised one goes on where it is
-        value, worst = last.value(mesh.points, zero)
+        value, least = judge.value(mesh.points, zero)
         begun = self._begin(mesh, constraints, before)
-        helped = (last.value(begun, zero)[0] < value) | (worst <= 0)
+        helped = (judge.value(begun, zero)[0] < value) | (least <= 0)
         start = mesh.with_points(jnp.where(helped, begun, mesh.points))
+        worst = _ordered(judge, start.points)[-1]
 
         def minimise(state, stage):
             give_up = tuple(out | ~stage.untangling for out in hopeless)
-            task = task_of(stage, state.points).giving_up(state.points, give_up)
+            task = task_of(stage, state.points)
+            pivot = jnp.where(stage.repairing, worst, task.aggregation.pivot)
+            task = eqx.tree_at(lambda t: t.aggregation.pivot, task, pivot).giving_up(state.points, give_up)
             found = self.minimiser(task, state.points)
             inverted = task.inverted(found.points, hopeless)
             waited = jnp.where(inverted < state.fewest, 0, state.waited + 1)
@@ -135,15 +142,19 @@ class Optimize(Method):
         def guarded(points):
             return _VALID(start, points - start.points, evaluate(start)).points
 
+        def sound(points):
+            return (tangled > 0) | (_ordered(judge, points)[-1] <= _SLACK * worst)
+
         def run(state, numbered):
             index, stage = numbered
             idle = stage.untangling & ((state.fewest == 0) | (state.waited > _PATIENCE))
+            idle |= jax.lax.cond(stage.repairing, sound, lambda _: jnp.bool_(False), state.points)
             state = jax.lax.cond(idle, lambda state, _: state, minimise, state, stage)
             untangled = (index == self.untangling_stages - 1) & (tangled > 0)
             points = jax.lax.cond(untangled, guarded, lambda points: points, state.points)
             return state._replace(points=points), None
 
-        tangled = last.inverted(start.points, hopeless)
+        tangled = judge.inverted(start.points, hopeless)
         first = _State(start.points, jnp.int32(0), tangled, jnp.int32(0))
         end, _ = jax.lax.scan(run, first, (jnp.arange(len(stages.power)), stages))
         finite = jnp.isfinite(end.points).all()
@@ -180,7 +191,12 @@ class Optimize(Method):
 
     def _pivot(self, task: Problem, points: Float[Array, "nodes dim"]) -> Float[Array, ""]:
         """The e that so many of the elements with weight exceed."""
-        e, weight = task.inverse_quality(points)
-        ordered = jnp.sort(jnp.where((weight > 0) & jnp.isfinite(e), e, -jnp.inf))
-        behind = jnp.floor(self.pivot * jnp.sqrt((weight > 0).sum())).astype(jnp.int32)
-        return jnp.maximum(ordered[jnp.maximum(len(ordered) - 1 - behind, 0)], 1)
+        e = _ordered(task, points)
+        behind = jnp.floor(self.pivot * jnp.sqrt((e > 0).sum())).astype(jnp.int32)
+        return jnp.maximum(e[jnp.maximum(len(e) - 1 - behind, 0)], 1)  # 1 where nothing may move
+
+
+def _ordered(task: Problem, points: Float[Array, "nodes dim"]) -> Float[Array, " elements"]:
+    """The finite e of the elements with weight in ascending order, after zeros for the others."""
+    e, weight = task.inverse_quality(points)
+    return jnp.sort(jnp.where((weight > 0) & jnp.isfinite(e), jnp.maximum(e, 1), 0))
