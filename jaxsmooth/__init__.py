@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 _HOMES = {
+    "acceptance": ("AcceptanceRule", "Statistics", "Status"),
     "batch": ("Batch", "stack"),
     "constraints": ("Constraints", "detect_constraints"),
     "elasticity": ("Material",),
@@ -26,12 +27,13 @@ _HOMES = {
     "patches": ("PatchGuard",),
     "metrics": ("METRICS", "quality", "quality_mean"),
     "runs": ("FixedPoint", "fixed_point", "run", "step"),
-    "smoothing": ("SmoothResult", "Status", "smooth", "statistics"),
+    "smoothing": ("SmoothResult", "smooth", "statistics"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = sorted(_HOME)
 
 if TYPE_CHECKING:
+    from jaxsmooth.acceptance import AcceptanceRule, Statistics, Status
     from jaxsmooth.batch import Batch, stack
     from jaxsmooth.constraints import Constraints, detect_constraints
     from jaxsmooth.elasticity import Material
@@ -43,7 +45,7 @@ if TYPE_CHECKING:
     from jaxsmooth.metrics import METRICS, quality, quality_mean
     from jaxsmooth.patches import PatchGuard
     from jaxsmooth.runs import FixedPoint, fixed_point, run, step
-    from jaxsmooth.smoothing import SmoothResult, Status, smooth, statistics
+    from jaxsmooth.smoothing import SmoothResult, smooth, statistics
 
 
 def __getattr__(name: str):

@@ -219,10 +219,7 @@ class Problem(eqx.Module):
 
             blocks, model = jax.lax.scan(add, blocks, block.fields)
             models.append(model)
-        rest = jnp.eye(dim, dtype=points.dtype) - self.projectors
-        scale = jnp.trace(blocks, axis1=-2, axis2=-1)[:, None, None]
-        inside = self.projectors @ blocks @ self.projectors + rest * jnp.where(scale > 0, scale, 1)
-        return tuple(models), block_inverse(inside)
+        return tuple(models), block_inverse(blocks, self.projectors)
 
     def apply(self, models: tuple[Model, ...], move: Field) -> Field:
         """The projected Hessian model times a displacement within the constraints."""

@@ -6,7 +6,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-__all__ = ["cofactors", "contract", "determinant", "least", "norm", "power", "solve_regular"]
+__all__ = [
+    "cofactors",
+    "contract",
+    "determinant",
+    "least",
+    "norm",
+    "power",
+    "solve_regular",
+    "unit_scale",
+]
 
 
 def contract(points: Float[Array, "k dim"], gradients: Float[Array, "q k j"]) -> Float[Array, "q dim j"]:
@@ -69,3 +78,13 @@ def solve_regular(a: Float[Array, "dim dim"], b: Float[Array, " dim"], floor: fl
     det, scale = determinant(a), jnp.trace(a)
     regular = det > floor * scale ** a.shape[-1]
     return jnp.where(regular, cofactors(a).T @ b / jnp.where(regular, det, 1), 0)
+
+
+def unit_scale(points: Float[Array, "nodes dim"]) -> Float[Array, ""]:
+    """The power of two that scales the extent of `points` to between 1/2 and 1; a constant.
+
+    Multiplying by it is exact, so what is computed on scaled points does not depend on the unit of
+    length, and their products neither over- nor underflow.
+    """
+    extent = jax.lax.stop_gradient(jnp.ptp(points, axis=0).max())
+    return jnp.ldexp(jnp.ones((), points.dtype), -jnp.frexp(extent)[1])

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import enum
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any
 
@@ -14,39 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxsmooth.acceptance import POOR, AcceptanceRule, Statistics, Status
 from jaxsmooth.constraints import Constraints, detect_constraints
 from jaxsmooth.mesh import Mesh
 from jaxsmooth.meshfile import as_mesh
 from jaxsmooth.methods import Elastic, Method
-from jaxsmooth.metrics import quality
 from jaxsmooth.patches import Evaluation, evaluate
 from jaxsmooth.runs import run
 
 __all__ = ["SmoothResult", "Statistics", "Status", "StepRecord", "smooth", "statistics"]
-
-
-class Status(enum.StrEnum):
-    """Why a run ended; the value is the message."""
-
-    CONVERGED = "converged"
-    STEP_LIMIT = "step limit"
-    STALLED = "stalled: no node may move without breaking the guard"
-    NO_GAIN = "stopped: the next step would have made nothing better"
-    NOT_FINITE = "stopped: the next step was not finite; the last finite mesh is returned"
-    UNSOLVED = "stopped: the linear system of the next step could not be solved"
-
-
-@dataclass(frozen=True)
-class Statistics:
-    """Statistics of a mesh; σ is the sample deviation, `below` counts q < 0.2."""
-
-    q_min: float
-    q_max: float
-    q_avg: float
-    q_std: float
-    below: int
-    inverted: int
-    scaled_jacobian_min: float
 
 
 @dataclass(frozen=True)
@@ -92,19 +67,19 @@ class SmoothResult:
 
 
 @partial(jax.jit, static_argnames=("threshold",))
-def _summary(evaluation: Evaluation, scaled: tuple[Array, ...], threshold: float) -> tuple[Array, ...]:
+def _summary(evaluation: Evaluation, threshold: float) -> tuple[Array, ...]:
     q, det = jnp.concatenate(evaluation.quality), jnp.concatenate(evaluation.jacobian)
     deviation = jnp.std(q, ddof=1) if q.size > 1 else jnp.zeros((), q.dtype)
-    worst = jnp.stack([part.min() for part in scaled]).min()
+    worst = jnp.stack([part.min() for part in evaluation.corners]).min()
     # ~(det > 0) counts NaN as inverted
     return q.min(), q.max(), q.mean(), deviation, (q < threshold).sum(), (~(det > 0)).sum(), worst
 
 
-def statistics(mesh: Any, evaluation: Evaluation | None = None, threshold: float = 0.2) -> Statistics:
+def statistics(mesh: Any, evaluation: Evaluation | None = None, threshold: float = POOR) -> Statistics:
     """Statistics of a mesh; an `evaluation` that is already known saves time."""
     mesh = as_mesh(mesh)
     evaluation = _evaluate(_bare(mesh)) if evaluation is None else evaluation
-    values = _summary(evaluation, quality(mesh, "scaled_jacobian"), threshold)
+    values = _summary(evaluation, threshold)
     q_min, q_max, q_avg, q_std, below, inverted, worst = (v.item() for v in jax.device_get(values))
     return Statistics(q_min, q_max, q_avg, q_std, below, inverted, worst)
 
@@ -128,6 +103,7 @@ def smooth(
     *,
     steps: int = 10,
     constraints: Constraints | None = None,
+    accept: AcceptanceRule | None = None,
     tolerance_avg: float = 1e-3,
     tolerance_min: float = 2e-2,
     callback: Callable[[StepRecord], None] | None = None,
@@ -138,10 +114,13 @@ def smooth(
         mesh: a `Mesh`, a `MeshFile`, a `meshio.Mesh`, or ``(points, {"tetra": connectivity})``.
         method: how a step is made; `Elastic()`, the paper's standard method, by default.
         steps: the largest number of steps.
-        constraints: how nodes may move; by default `detect_constraints(mesh)`, with the nodes that
-            a `MeshFile` marks as `fixed` held.
+        constraints: how nodes may move; by default `detect_constraints(mesh)`.
+        accept: what the result keeps of the input; by default what the method's `acceptance` says:
+            no more inverted or poor elements, no worse worst element and corner, no lower average.
         tolerance_avg: the run has converged when a step changes the average quality by less than
-            this and the least quality by less than `tolerance_min`.  0 runs all steps.
+            this, the least quality by less than `tolerance_min`, and the numbers of inverted and poor
+            elements not at all; while elements are inverted, when three steps in a row do so.
+            0 runs all steps.
         tolerance_min: see above.
         callback: called with every `StepRecord`, the input's first.
 
@@ -149,55 +128,100 @@ def smooth(
     the history is empty.
 
     Returns:
-        The smoothed mesh with its history.  A valid mesh stays valid under every guarded method.
+        The smoothed mesh with its history: the last step that `accept` has nothing against.
 
     Raises:
         ValueError: for an invalid mesh, or constraints that do not fit it.
     """
-    fixed = getattr(mesh, "fixed", None)  # a file may name nodes to hold
     mesh = as_mesh(mesh)
     method = (Elastic() if method is None else method).prepare(mesh)
     if isinstance(mesh.points, jax.core.Tracer):
         return _smooth_traced(mesh, method, steps, constraints)
-    constraints = detect_constraints(mesh, fixed=fixed) if constraints is None else constraints
+    constraints = detect_constraints(mesh) if constraints is None else constraints
     _check(mesh, constraints, steps)
+    accept = method.acceptance if accept is None else accept
     labels, mesh = mesh.labels, _bare(mesh)
-
-    history: list[StepRecord] = []
-
-    def record(row: StepRecord) -> None:
-        history.append(row)
-        if callback is not None:
-            callback(row)
 
     start = time.perf_counter()
     evaluation = _evaluate(mesh)
-    current = statistics(mesh, evaluation)
-    record(StepRecord(0, current, seconds=time.perf_counter() - start))
-    status = Status.STEP_LIMIT
-    for index in range(1, steps + 1):
-        start = time.perf_counter()
-        step = _step(method, mesh, constraints, evaluation)
-        if not bool(jnp.isfinite(step.points).all()):
-            status = Status.NOT_FINITE if bool(jnp.isfinite(step.residual)) else Status.UNSOLVED
-            break
-        still = bool((step.points == mesh.points).all())
-        moved = mesh.with_points(step.points)
-        previous, current = current, statistics(moved, step.evaluation)
-        settled = (
-            abs(current.q_avg - previous.q_avg) < tolerance_avg
-            and abs(current.q_min - previous.q_min) < tolerance_min
+    first = StepRecord(0, statistics(mesh, evaluation), seconds=time.perf_counter() - start)
+    driver = _Driver(constraints, accept, (tolerance_avg, tolerance_min), callback)
+    driver.record(first)
+    (mesh, evaluation), status = driver.run(method, mesh, evaluation, steps)
+    return SmoothResult(
+        mesh.with_labels(labels), evaluation.quality, tuple(driver.history), status, constraints
+    )
+
+
+_PATIENCE = 3  # steps without change after which a mesh is taken to stay tangled
+_EXCURSION = 2  # steps that may break the rule before one that meets it again
+
+
+@dataclass
+class _Driver:
+    """The loop of `smooth`; `history` has the steps that count."""
+
+    constraints: Constraints
+    accept: AcceptanceRule
+    tolerances: tuple[float, float]
+    callback: Callable[[StepRecord], None] | None
+    history: list[StepRecord] = field(default_factory=list)
+
+    def record(self, row: StepRecord) -> None:
+        """One more step that counts."""
+        self.history.append(row)
+        if self.callback is not None:
+            self.callback(row)
+
+    def run(
+        self, method: Method, mesh: Mesh, evaluation: Evaluation, steps: int
+    ) -> tuple[tuple[Mesh, Evaluation], Status]:
+        """Make the steps; where they lead nowhere, go back and on with the stricter method.
+
+        Returns the mesh of the last step that counts, its evaluation, and why the run ended.
+        """
+        reached, stricter = (mesh, evaluation), method.stricter
+        waiting: list[StepRecord] = []  # steps that do not count, unless one after them does
+        settled = 0
+        while (index := len(self.history) + len(waiting)) <= steps:
+            start = time.perf_counter()
+            step = _step(method, mesh, self.constraints, evaluation)
+            if not bool(jnp.isfinite(step.points).all()):
+                return reached, Status.NOT_FINITE if bool(jnp.isfinite(step.residual)) else Status.UNSOLVED
+            still = bool((step.points == mesh.points).all()) and not waiting
+            mesh, evaluation = mesh.with_points(step.points), step.evaluation
+            now = statistics(mesh, evaluation)
+            counts = int(step.iterations), float(step.residual), int(step.shortened)
+            settled = settled + 1 if self._settled((waiting or self.history)[-1].statistics, now) else 0
+            done = still or settled >= (_PATIENCE if now.inverted else 1)
+            waiting.append(StepRecord(index, now, *counts, time.perf_counter() - start))
+            refusal = None if still else self._objection(now, mesh)
+            if refusal is None:
+                for row in waiting:
+                    self.record(row)
+                reached, waiting = (mesh, evaluation), []
+                if done:
+                    return reached, Status.STALLED if still and counts[2] else Status.CONVERGED
+            elif done or len(waiting) > _EXCURSION or index == steps:
+                if stricter is None or (settled and len(waiting) == 1):
+                    return reached, Status.CONVERGED if settled else refusal
+                method, stricter, settled = stricter, None, 0
+                (mesh, evaluation), waiting = reached, []
+        return reached, Status.STEP_LIMIT
+
+    def _objection(self, now: Statistics, mesh: Mesh) -> Status | None:
+        first, last = self.history[0].statistics, self.history[-1].statistics
+        rounding = 64 * float(jnp.finfo(mesh.points.dtype).eps)  # qualities are of order 1
+        return self.accept.objection(first, last, now, rounding)
+
+    def _settled(self, before: Statistics, now: Statistics) -> bool:
+        """Whether a step has changed nothing that counts."""
+        average, least = self.tolerances
+        return (
+            abs(now.q_avg - before.q_avg) < average
+            and abs(now.q_min - before.q_min) < least
+            and (now.below, now.inverted) == (before.below, before.inverted)
         )
-        if method.guard is not None and not still and not _better(current, previous):
-            status = Status.CONVERGED if settled else Status.NO_GAIN
-            break
-        mesh, evaluation = moved, step.evaluation
-        counts = int(step.iterations), float(step.residual), int(step.shortened)
-        record(StepRecord(index, current, *counts, time.perf_counter() - start))
-        if still or settled:
-            status = Status.STALLED if still and counts[2] else Status.CONVERGED
-            break
-    return SmoothResult(mesh.with_labels(labels), evaluation.quality, tuple(history), status, constraints)
 
 
 def _smooth_traced(mesh: Mesh, method: Method, steps: int, constraints: Constraints | None) -> SmoothResult:
@@ -213,16 +237,6 @@ def _smooth_traced(mesh: Mesh, method: Method, steps: int, constraints: Constrai
         constraints = Constraints(jax.pure_callback(detect, shape, fixed, vmap_method="sequential"))
     labels, mesh = mesh.labels, run(_bare(mesh), method, constraints=constraints, steps=steps)
     return SmoothResult(mesh.with_labels(labels), evaluate(mesh).quality, (), Status.STEP_LIMIT, constraints)
-
-
-def _better(now: Statistics, before: Statistics) -> bool:
-    """True if anything improved: fewer inverted or poor elements, a higher q_min or q_avg."""
-    return (
-        now.inverted < before.inverted
-        or now.below < before.below
-        or now.q_min > before.q_min
-        or now.q_avg > before.q_avg
-    )
 
 
 def _check(mesh: Mesh, constraints: Constraints, steps: int) -> None:

@@ -36,16 +36,24 @@ def project(projectors: Float[Array, "nodes dim dim"], field: Field) -> Field:
     return (projectors * field[:, None, :]).sum(axis=-1)
 
 
-def block_inverse(blocks: Float[Array, "nodes dim dim"]) -> Float[Array, "nodes dim dim"]:
-    """Inverses of symmetric positive definite node blocks; identity where a block is singular."""
+def block_inverse(
+    blocks: Float[Array, "nodes dim dim"], projectors: Float[Array, "nodes dim dim"]
+) -> Float[Array, "nodes dim dim"]:
+    """Inverses of symmetric non-negative node blocks within the constraints.
+
+    A block ``P B P`` is completed by ``s (I − P)``, s its own size, so that it can be inverted whatever
+    the units of B are; where it is singular all the same, s stands for it.
+    """
     dim = blocks.shape[-1]
-    scale = jnp.trace(blocks, axis1=-2, axis2=-1)[:, None, None] / dim
+    eye = jnp.eye(dim, dtype=blocks.dtype)
+    inside = projectors @ blocks @ projectors
+    scale = jnp.trace(inside, axis1=-2, axis2=-1)[:, None, None] / dim
     scale = jnp.where(scale > 0, scale, 1)
-    blocks = blocks / scale
+    blocks = inside / scale + (eye - projectors)
     det = determinant(blocks)[:, None, None]
     regular = det > jnp.finfo(blocks.dtype).eps
     inverse = cofactors(blocks) / jnp.where(regular, det, 1)
-    return jnp.where(regular, inverse, jnp.eye(dim, dtype=blocks.dtype)) / scale
+    return jnp.where(regular, inverse, eye) / scale
 
 
 _RESTARTS = 4
@@ -160,7 +168,7 @@ def gradient_tolerance(dtype: Any) -> float:
 def _solve(system, tolerance, max_iterations) -> Solution:
     matvec, right, solver = _equations(system, tolerance, max_iterations)
     field, (iterations, residual) = solver(matvec, right)
-    return Solution(field, iterations, residual)
+    return Solution(project(system[2], field), iterations, residual)
 
 
 @_solve.defjvp
@@ -187,7 +195,7 @@ def _equations(system, tolerance, max_iterations):
     """The operator P K P + (I − P), the right-hand side P f, and a solver for them."""
     operator, diagonal, projectors, force = system
     rest = jnp.eye(force.shape[-1], dtype=force.dtype) - projectors
-    inverse = jax.lax.stop_gradient(block_inverse(projectors @ diagonal @ projectors + rest))
+    inverse = jax.lax.stop_gradient(block_inverse(diagonal, projectors))
 
     def matvec(u: Field) -> Field:
         return project(projectors, operator(project(projectors, u))) + project(rest, u)
@@ -196,9 +204,13 @@ def _equations(system, tolerance, max_iterations):
         """The same on the null space, which the iteration does not leave."""
         return project(projectors, operator(u))
 
+    def precondition(r: Field) -> Field:
+        return project(projectors, project(inverse, r))
+
     def solver(_, b):
-        inside = project(projectors, b)  # a cotangent has a part outside, where A is the identity
-        found = conjugate_gradients(within, inside, lambda r: project(inverse, r), tolerance, max_iterations)
+        inside = project(projectors, b)
+        found = conjugate_gradients(within, inside, precondition, tolerance, max_iterations)
+        # outside, where a tangent or cotangent has a part, A is the identity
         return found.field + (b - inside), (found.iterations, found.residual)
 
     return matvec, project(projectors, force), solver

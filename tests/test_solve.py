@@ -169,10 +169,16 @@ def test_block_inverse():
     root = rng.normal(size=(5, 3, 3))
     blocks = np.einsum("nij,nkj->nik", root, root) * np.array([1, 1e-30, 1e30, 1, 1])[:, None, None]
     blocks[3] = 0
-    found = np.asarray(block_inverse(jnp.asarray(blocks)))
-    for n in (0, 1, 2, 4):
+    projectors = np.tile(np.eye(3), (5, 1, 1))
+    projectors[4] = np.diag([1, 1, 0])
+    found = np.asarray(block_inverse(jnp.asarray(blocks), jnp.asarray(projectors)))
+    for n in (0, 1, 2):
         np.testing.assert_allclose(found[n] @ blocks[n], np.eye(3), atol=1e-9)
     np.testing.assert_array_equal(found[3], np.eye(3))
+    np.testing.assert_allclose(found[4][:2, :2] @ blocks[4][:2, :2], np.eye(2), atol=1e-12)
+    # the size of a block, not that of 1, decides what is singular: in nanometres nothing changes
+    small = np.asarray(block_inverse(jnp.asarray(blocks[4:] * 2.0**-90), jnp.asarray(projectors[4:])))
+    np.testing.assert_allclose(small[0] * 2.0**-90, found[4], rtol=1e-13)
 
 
 @jax.jit

@@ -10,9 +10,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxsmooth.acceptance import AcceptanceRule
 from jaxsmooth.constraints import Constraints
 from jaxsmooth.mesh import Mesh
-from jaxsmooth.patches import Evaluation, Guarded, evaluate
+from jaxsmooth.patches import Evaluation, Guarded, PatchGuard, evaluate
 
 __all__ = ["Method", "Proposal", "Step"]
 
@@ -46,6 +47,18 @@ class Method(eqx.Module):
     def prepare(self, mesh: Mesh) -> Method:
         """Host-side work on the topology, done once before the first step; by default none."""
         return self
+
+    @property
+    def acceptance(self) -> AcceptanceRule:
+        """What a run with this method keeps of its input, unless the user says otherwise."""
+        return AcceptanceRule() if self.guard is not None else AcceptanceRule.anything()
+
+    @property
+    def stricter(self) -> Method | None:
+        """The method with a guard that lets q_min and the least scaled Jacobian of a mesh never fall."""
+        if not isinstance(self.guard, PatchGuard):
+            return None
+        return eqx.tree_at(lambda method: method.guard.keep, self, 1.0)
 
     @abc.abstractmethod
     def propose(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Proposal:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from functools import partial
 
 import equinox as eqx
@@ -9,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsmooth.acceptance import AcceptanceRule
 from jaxsmooth.constraints import Constraints
 from jaxsmooth.elasticity import ElementBlock, Material, Operator, element_force, linearise
 from jaxsmooth.fitting import target_element
@@ -16,7 +19,7 @@ from jaxsmooth.mesh import Mesh, gather, scatter_add
 from jaxsmooth.methods.base import Method, Proposal
 from jaxsmooth.metrics import measure, shape_quality
 from jaxsmooth.patches import Evaluation, PatchGuard, patch_mean
-from jaxsmooth.small import least
+from jaxsmooth.small import least, unit_scale
 from jaxsmooth.solve import solve_projected
 
 __all__ = ["Elastic"]
@@ -46,8 +49,16 @@ class Elastic(Method):
     tolerance: float = 3e-2
     max_iterations: int = 1000
 
+    @property
+    def acceptance(self) -> AcceptanceRule:
+        """The extended method gives some of the average quality for the worst elements."""
+        rule = super().acceptance
+        return replace(rule, average=math.inf) if self.extended else rule
+
     def propose(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Proposal:
         """Solve K U = F (Eqs. 31–36) in the null space of the constraints."""
+        unit = unit_scale(mesh.points)
+        mesh = mesh.with_points(mesh.points * unit)
         count = len(mesh.points)
         force = jnp.zeros_like(mesh.points)
         blocks = []
@@ -64,16 +75,15 @@ class Elastic(Method):
             force = force + scatter_add(pull, nodes, count)
             blocks.append(ElementBlock.cut(nodes, elements))
         operator = Operator(tuple(blocks), self.material)
-        return Proposal(
-            *solve_projected(
-                operator,
-                operator.diagonal(count),
-                constraints.projectors,
-                force,
-                self.tolerance,
-                self.max_iterations,
-            )
+        found = solve_projected(
+            operator,
+            operator.diagonal(count),
+            constraints.projectors,
+            force,
+            self.tolerance,
+            self.max_iterations,
         )
+        return Proposal(found.field / unit, found.iterations, found.residual)
 
     def priorities(self, mesh: Mesh) -> tuple[Float[Array, " elements"], ...]:
         """(1 − q) / (1 − q_min) of Eq. 35; zero where all elements are ideal."""

@@ -16,7 +16,7 @@ from jaxsmooth.mesh import Mesh, gather, scatter_add
 from jaxsmooth.methods.base import Method, Proposal
 from jaxsmooth.metrics import min_jacobian, shape_quality
 from jaxsmooth.patches import Evaluation, Guarded, PatchGuard, patch_min
-from jaxsmooth.small import contract, determinant
+from jaxsmooth.small import contract, determinant, unit_scale
 from jaxsmooth.topology import node_pairs
 
 __all__ = ["Laplacian", "SmartGuard"]
@@ -98,9 +98,9 @@ class RisingGuard(PatchGuard):
 
     halvings: int = eqx.field(static=True, default=0)
 
-    def threshold(self, least: Float[Array, " nodes"]) -> Float[Array, " nodes"]:
+    def threshold(self, least: Float[Array, " nodes"], floor: Float[Array, ""]) -> Float[Array, " nodes"]:
         """Above the least quality by more than rounding."""
-        return least + rounding(least)
+        return least + 2 * rounding(least)
 
 
 class SmartGuard(eqx.Module):
@@ -121,7 +121,12 @@ class SmartGuard(eqx.Module):
     def __call__(self, mesh: Mesh, move: Field, before: Evaluation, beta=2.0) -> Guarded:
         """Move the nodes of `mesh` by `move` ``[nodes, dim]`` where the patches profit."""
         stopped = jax.lax.stop_gradient
-        frozen, plain, start = mesh.with_points(stopped(mesh.points)), stopped(move), stopped(before)
+        scale = unit_scale(mesh.points)
+        frozen, plain, start = (
+            mesh.with_points(stopped(mesh.points) * scale),
+            stopped(move) * scale,
+            stopped(before),
+        )
         together = RisingGuard()
 
         def best(points: Field, evaluation: Evaluation, waiting: Array) -> Bool[Array, " nodes"]:

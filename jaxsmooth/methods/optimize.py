@@ -17,6 +17,7 @@ from jaxsmooth.methods.elastic import Elastic, target_measures
 from jaxsmooth.minimise import Minimiser, Newton
 from jaxsmooth.objective import Aggregation, Problem, problem
 from jaxsmooth.patches import Evaluation, PatchGuard, evaluate
+from jaxsmooth.small import unit_scale
 
 __all__ = ["GOALS", "Optimize", "Stage"]
 
@@ -37,7 +38,8 @@ class Stage(NamedTuple):
     repairing: bool = False
 
 
-_VALID = PatchGuard(gamma=0.0, poor=0.0)  # only against inversion
+_VALID = PatchGuard(gamma=0.0, poor=0.0, corner=0.0)  # only against inversion
+_KEEPS = PatchGuard(gamma=0.0)  # and against elements that turn poor
 _PATIENCE = 4  # untangling stages without success
 _UNTANGLE = Stage(0, 1, 2, untangling=True)  # unlike the mean of 1 − q, it grows without bound
 _REPAIR = Stage(1, 30, 32, repairing=True)
@@ -49,7 +51,7 @@ GOALS: dict[str, tuple[Stage, ...]] = {
     # a p-norm of 1/q that comes ever closer to the maximum
     "worst": (Stage(0, 1, 4), Stage(0, 1, 8), Stage(0, 1, 16)),
     # the mean of 1 − q, and a penalty on what is worse than the pivot, then than the worst at the start
-    "balanced": (Stage(1, 1, 4), Stage(1, 0.3, 16), _REPAIR),
+    "balanced": (Stage(1, 1, 4), Stage(1, 2, 8), _REPAIR),
 }
 
 
@@ -81,7 +83,7 @@ class Optimize(Method):
         untangling_steps: their number while elements are inverted.
         untangling_stages: bound on the minimisations that follow while elements are inverted; they end
             earlier when several of them have not made the inverted elements fewer.
-        guard: refuses moves that invert an element.
+        guard: refuses moves that invert an element, make it poor, or worse if it is poor.
 
     A step is a whole optimisation; another one goes on from there.  It is not differentiable in reverse mode.
     """
@@ -97,7 +99,7 @@ class Optimize(Method):
     start_steps: int = 2
     untangling_steps: int = 10
     untangling_stages: int = eqx.field(static=True, default=20)
-    guard: PatchGuard | None = _VALID
+    guard: PatchGuard | None = _KEEPS
 
     def __check_init__(self):
         for name, known in (("goal", GOALS), ("metric", METRICS), ("target", TARGETS)):
@@ -109,7 +111,9 @@ class Optimize(Method):
     def propose(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Proposal:
         """The displacement to the optimised mesh."""
         mesh, constraints = jax.lax.stop_gradient((mesh, constraints))
-        sizes = self._sizes(mesh)
+        scale = unit_scale(mesh.points)
+        mesh = mesh.with_points(mesh.points * scale)
+        sizes = self._sizes(mesh, scale)
         stages = (_UNTANGLE,) * self.untangling_stages + GOALS[self.goal]
         stages = jax.tree.map(lambda *values: jnp.stack([jnp.asarray(v) for v in values]), *stages)
         zero = jnp.zeros((), mesh.points.dtype)
@@ -158,7 +162,8 @@ class Optimize(Method):
         first = _State(start.points, jnp.int32(0), tangled, jnp.int32(0))
         end, _ = jax.lax.scan(run, first, (jnp.arange(len(stages.power)), stages))
         finite = jnp.isfinite(end.points).all()
-        return Proposal(jnp.where(finite, end.points - mesh.points, 0), end.iterations, zero)
+        move = jnp.where(finite, end.points - mesh.points, 0)
+        return Proposal(move / scale, end.iterations, zero)
 
     def _begin(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Float[Array, "nodes dim"]:
         """The points after the steps of the starting method."""
@@ -177,13 +182,17 @@ class Optimize(Method):
 
         return jax.lax.while_loop(unfinished, step, (mesh.points, before, jnp.int32(0)))[0]
 
-    def _sizes(self, mesh: Mesh) -> tuple[Float[Array, " elements"], ...]:
+    def _sizes(self, mesh: Mesh, scale: Float[Array, ""]) -> tuple[Float[Array, " elements"], ...]:
+        """Of a mesh that has been scaled; given sizes are not."""
         own = target_measures(mesh)
         if self.target != "given size":
             return own
-        if isinstance(self.size, tuple):
-            return tuple(jnp.asarray(size, part.dtype) for size, part in zip(self.size, own, strict=True))
-        return tuple(jnp.full_like(part, self.size) for part in own)
+        given = self.size if isinstance(self.size, tuple) else (self.size,) * len(own)
+        unit = scale**mesh.dim
+        return tuple(
+            jnp.full_like(part, 1) * jnp.asarray(size, part.dtype) * unit
+            for size, part in zip(given, own, strict=True)
+        )
 
     def _problem(self, mesh, constraints, sizes, aggregation) -> Problem:
         weight = 0.0 if self.target == "free size" else self.size_weight
