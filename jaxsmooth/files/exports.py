@@ -9,13 +9,13 @@ from pathlib import Path
 
 import meshio
 import numpy as np
-from meshio._helpers import _writer_map
+from meshio._helpers import _writer_map, reader_map
 
 from jaxsmooth.elements import supported
 from jaxsmooth.files.abaqus import ABAQUS_TYPES, write_abaqus
-from jaxsmooth.files.checks import MeshFileError
+from jaxsmooth.files.checks import SYNONYMS, MeshFileError
 from jaxsmooth.files.exodus import write_exodus
-from jaxsmooth.files.formats import quiet, stem_format
+from jaxsmooth.files.formats import quiet, read_format, stem_format
 from jaxsmooth.files.medit import MEDIT_SETS, append_medit_sets
 from jaxsmooth.files.msh import split_by_entity, write_data_sections, write_msh41
 from jaxsmooth.files.reduction import (
@@ -47,6 +47,7 @@ _HOLDS = {
 """Cell types of formats that hold only some of those that this package knows."""
 
 _SURFACES = {"stl", "obj", "off", "ply", "svg", "wkt", "neuroglancer"}
+_ONE_BLOCK = {"med", "hmf", "h5m"}  # of a type
 _SEVERAL_FILES = {"tetgen": ".node and .ele", "dolfin-xml": "one for every data array"}
 _NEEDS = {"exodus": "netCDF4", "med": "h5py", "h5m": "h5py", "hmf": "h5py", "cgns": "h5py", "xdmf": "h5py"}
 
@@ -112,7 +113,7 @@ def write_source(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> list[s
         reduce_data(mesh, stem, dim, notes)
     try:
         with quiet() as said:
-            _WRITERS.get(stem, _write_any)(path, mesh, format, dim)
+            notes += _WRITERS.get(stem, _write_rare)(path, mesh, format, dim) or []
             if own_sets:
                 append_medit_sets(path, own_sets)
     except ModuleNotFoundError as error:
@@ -202,6 +203,51 @@ def _write_any(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> None:
     meshio.write(path, mesh, file_format=stem_format(format))
 
 
+def _write_rare(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> list[str]:
+    """Formats whose writers leave out cells or data without a word: what they wrote is read again.
+
+    Returns notes on what is missing then."""
+    stem = stem_format(format)
+    if stem in _ONE_BLOCK:
+        _merge_blocks(mesh)
+    said = dict.fromkeys((*mesh.point_data, *mesh.cell_data))
+    if stem == "h5m":  # fails with any
+        mesh.cell_data = {}
+    material = material_name(mesh, dim)
+    meshio.write(path, mesh, file_format=stem)
+    if stem not in reader_map:
+        return []
+    again = read_format(path, stem)
+    if len(again.points) != len(mesh.points) or _sizes(again) != _sizes(mesh):
+        raise ValueError(f"it would have {_sizes(again)} instead of {_sizes(mesh)}")
+    kept = {*again.point_data, *again.cell_data, "gmsh:dim_tags"}
+    if material_name(again, dim):
+        kept.add(material)
+    lost = [name for name in said if name not in kept]
+    return [f"{stem} files can't hold these data, which are not written: {', '.join(lost)}"] if lost else []
+
+
+def _sizes(mesh: meshio.Mesh) -> str:
+    sizes: dict[str, int] = {}
+    for cells in mesh.cells:
+        name = SYNONYMS.get(cells.type, cells.type)
+        sizes[name] = sizes.get(name, 0) + len(cells)
+    return ", ".join(f"{n} {name}" for name, n in sorted(sizes.items())) or "no cells"
+
+
+def _merge_blocks(mesh: meshio.Mesh) -> None:
+    """One cell block a type."""
+    parts = {c.type: [k for k, o in enumerate(mesh.cells) if o.type == c.type] for c in mesh.cells}
+    mesh.cell_data = {
+        name: [np.concatenate([values[k] for k in own]) for own in parts.values()]
+        for name, values in mesh.cell_data.items()
+    }
+    mesh.cells = [
+        meshio.CellBlock(kind, np.concatenate([mesh.cells[k].data for k in own]))
+        for kind, own in parts.items()
+    ]
+
+
 def _write_vtk(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> None:
     mesh.point_data = {name.replace(" ", "_"): v for name, v in mesh.point_data.items()}
     mesh.cell_data = {name.replace(" ", "_"): v for name, v in mesh.cell_data.items()}
@@ -267,6 +313,8 @@ def _write_npz(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> None:
 
 
 _WRITERS = {
+    "vtu": _write_any,
+    "medit": _write_any,
     "vtk": _write_vtk,
     "vtk42": _write_vtk,
     "xdmf": _write_xdmf,

@@ -35,6 +35,7 @@ __all__ = [
     "detect_format",
     "format_of_suffix",
     "quiet",
+    "read_format",
     "read_source",
     "stem_format",
 ]
@@ -160,6 +161,11 @@ def _reason(error: BaseException, said: str) -> str:
 
 def _read_any(path: Path, name: str) -> tuple[meshio.Mesh, list[str]]:
     return meshio.read(path, file_format=_reader(name)), []
+
+
+def read_format(path: Path, stem: str) -> meshio.Mesh:
+    """Read a file of a known format, whatever its name says; raises anything."""
+    return _READERS.get(stem, _read_any)(path, stem)[0]
 
 
 def _reader(name: str) -> str:

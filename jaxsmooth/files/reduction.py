@@ -145,8 +145,9 @@ def reduce_data(mesh: meshio.Mesh, stem: str, dim: int, notes: list[str]) -> Non
     elif stem in _OWN_TAGS:
         lost = _keep_tags(mesh, stem, dim)
     else:  # meshio knows best; what it leaves out differs from format to format
-        if name := material_name(mesh, dim):  # it takes the first
-            mesh.cell_data = {name: as_tags(mesh.cell_data[name]), **mesh.cell_data}
+        if name := material_name(mesh, dim):  # it takes the first whole numbers, or those of its own name
+            tags = as_tags(mesh.cell_data.pop(name))
+            mesh.cell_data = {"nastran:ref" if stem == "nastran" else name: tags, **mesh.cell_data}
         return
     lost = [n for n in lost if n != "gmsh:dim_tags"]
     if lost:
@@ -163,6 +164,8 @@ def _keep_tags(mesh: meshio.Mesh, stem: str, dim: int) -> list[str]:
         blocks = [k for k, cells in enumerate(mesh.cells) if cells.dim == of_boundary]
         tagged = [n for n, tags in region_arrays(mesh, blocks) if any(t.any() for t in tags.values())]
         name = own if own in tagged else next(iter(tagged), None)
+        if of_boundary == dim and own not in tagged:  # plane meshes in .ugrid
+            name = material
     lost = [n for n in lost if n not in (name, "medit:ref")]
     if name and name == material and stem == "su2":
         lost.append(f"{name} of the elements")
