@@ -53,8 +53,10 @@ _FAMILIES = (
 )
 
 
-_SILENT = ("HEADING", "PREPRINT", "ASSEMBLY", "END ASSEMBLY")
+_SILENT = ("PREPRINT", "ASSEMBLY", "END ASSEMBLY")
 _MAKING = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY")
+
+_HEADING = "written by jaxsmooth:"  # with counts, for nothing else in these files tells their end
 
 ABAQUS_TYPES = "abaqus:types"
 """In `meshio.Mesh.info`: the element type of every cell block by Abaqus' name."""
@@ -108,9 +110,11 @@ def read_abaqus(path: Path) -> tuple[meshio.Mesh, list[str]]:
 
     Returns the mesh and notes.  Raises `ValueError` in one sentence."""
     model, parts, instances, others = _Part(), {}, {}, set()
-    current = model
+    current, heading = model, ""
     for key, options, lines in read_cards(path):
-        if key == "PART":
+        if key == "HEADING":
+            heading = heading or " ".join(lines)
+        elif key == "PART":
             current = parts[options.get("NAME", "").upper()] = _Part()
         elif key == "INSTANCE":
             name, part = options.get("NAME", ""), options.get("PART", "")
@@ -128,6 +132,11 @@ def read_abaqus(path: Path) -> tuple[meshio.Mesh, list[str]]:
         raise ValueError("it has more than one *PART but no *INSTANCE; write each part to a file of its own")
     placed += [model] if model.ids or not placed else []
     mesh, notes = _assemble(placed)
+    found = f"{len(mesh.points)} nodes, {sum(map(len, mesh.cells))} elements"
+    if heading.startswith(_HEADING) and heading.removeprefix(_HEADING).strip() != found:
+        raise ValueError(
+            f"it has {found} and says{heading.removeprefix(_HEADING)}; the file is damaged or cut short"
+        )
     if others:
         named = ", ".join(sorted(others)[:4]) + (", …" if len(others) > 4 else "")
         notes.append(
@@ -350,7 +359,7 @@ def write_abaqus(path: Path, mesh: meshio.Mesh) -> None:
         raise ValueError(f"Abaqus files have no {missing[0]} elements")
     starts = np.cumsum([0] + [len(cells) for cells in mesh.cells])
     with open(path, "w") as out:
-        out.write("*HEADING\nwritten by jaxsmooth\n*NODE\n")
+        out.write(f"*HEADING\n{_HEADING} {len(mesh.points)} nodes, {starts[-1]} elements\n*NODE\n")
         numbers = np.arange(1, len(mesh.points) + 1)
         width = mesh.points.shape[1]
         rows = np.column_stack([numbers, mesh.points])

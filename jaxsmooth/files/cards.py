@@ -8,16 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxsmooth.files.checks import check_last_line
+
 __all__ = ["integers_of", "nodes_of", "read_cards", "set_members"]
 
 
 def read_cards(path: Path, depth: int = 0) -> Iterator[tuple[str, dict[str, str], list[str]]]:
     """Keyword, options and data lines of every card."""
     text = path.read_text(encoding="utf-8", errors="replace")
-    if not text.endswith("\n") and (last := text.rpartition("\n")[2].strip()) and not last.startswith("*"):
-        raise ValueError(
-            f"the last line of {path.name} has no end, so it may be cut short; complete or end it"
-        )
+    check_last_line(text.encode(), b"**")
     for card in re.split(r"^(?=\*[^*])", text, flags=re.MULTILINE):
         if not card.startswith("*") or card.startswith("**"):
             continue

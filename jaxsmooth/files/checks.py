@@ -15,6 +15,7 @@ __all__ = [
     "SYNONYMS",
     "MeshFileError",
     "check_cells",
+    "check_last_line",
     "check_points",
     "check_references",
     "dimension",
@@ -156,6 +157,15 @@ def in_plane(points: np.ndarray, numbering: Sequence[np.ndarray], dim: int) -> n
             "give volume elements, or a plane mesh in x and y"
         )
     return points[:, :2]
+
+
+def check_last_line(content: bytes, comment: bytes = b"#") -> None:
+    """Raise `ValueError` where a text file ends within a line, so that its last number may be cut."""
+    last = content.replace(b"\r", b"\n").rpartition(b"\n")[2].strip()
+    if last and not last.startswith(comment):
+        raise ValueError(
+            "its last line has no end, so the file may be cut short; complete it or end the line"
+        )
 
 
 def parse_numbers(text: str | bytes, place: str, dtype: Any = np.float64) -> np.ndarray:

@@ -7,6 +7,7 @@ both: ``"gmsh22:ascii"``, ``"gmsh:binary"`` (that is 4.1), ``"vtk42:binary"``, `
 from __future__ import annotations
 
 import contextlib
+import gzip
 import io
 import re
 import tempfile
@@ -20,7 +21,7 @@ from meshio._helpers import extension_to_filetypes
 
 from jaxsmooth.elements import TYPES
 from jaxsmooth.files.abaqus import is_abaqus, read_abaqus
-from jaxsmooth.files.checks import MeshFileError, check_references
+from jaxsmooth.files.checks import MeshFileError, check_last_line, check_references
 from jaxsmooth.files.exodus import read_exodus
 from jaxsmooth.files.medit import read_medit
 from jaxsmooth.files.msh import keep_groups, read_msh_data, repaired_msh, sniff_msh
@@ -41,6 +42,8 @@ __all__ = [
 ]
 
 NPZ_TYPES = ("vertex", *TYPES)
+_TEXT = {"avsucd", "flac3d", "mdpa", "nastran", "netgen", "permas", "tecplot"}
+_ENDS = {"nastran": b"\nENDDATA", "netgen": b"\nendmesh"}  # meshio waits for the first for ever
 
 
 def stem_format(name: str) -> str:
@@ -147,6 +150,8 @@ def _said(text: str) -> list[str]:
 def _reason(error: BaseException, said: str) -> str:
     text = str(error).strip() if not isinstance(error, SystemExit) else " ".join(_said(said)[:1])
     text = " ".join(text.split())
+    if text.startswith("Couldn't read file"):  # meshio, without a reason
+        text = ""
     if isinstance(error, KeyError):
         text = f"it has something unknown, {text}"
     elif not isinstance(error, (ValueError, RuntimeError, OSError, SystemExit)):
@@ -160,6 +165,11 @@ def _reason(error: BaseException, said: str) -> str:
 
 
 def _read_any(path: Path, name: str) -> tuple[meshio.Mesh, list[str]]:
+    if name in _TEXT:
+        content = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+        check_last_line(content)
+        if name in _ENDS and _ENDS[name] not in content:
+            raise ValueError(f"it has no line {_ENDS[name].decode()}; the file is damaged or cut short")
     return meshio.read(path, file_format=_reader(name)), []
 
 
@@ -205,12 +215,6 @@ def _read_vtu(path: Path, name: str) -> tuple[meshio.Mesh, list[str]]:
     return mesh, []
 
 
-def _read_nastran(path: Path, name: str) -> tuple[meshio.Mesh, list[str]]:
-    if re.search(rb"^ENDDATA", path.read_bytes(), re.MULTILINE) is None:  # meshio waits for it for ever
-        raise ValueError("it has no line ENDDATA; the file is damaged or cut short")
-    return _read_any(path, name)
-
-
 def _read_ugrid(path: Path, name: str) -> tuple[meshio.Mesh, list[str]]:
     return (read_ugrid(path), []) if is_text(path) else _read_any(path, name)
 
@@ -218,7 +222,7 @@ def _read_ugrid(path: Path, name: str) -> tuple[meshio.Mesh, list[str]]:
 def _read_npz(path: Path, name: str) -> tuple[meshio.Mesh, list[str]]:
     """``points``, one array a cell type, ``type/name`` for cell data; else point data."""
     notes = []
-    with np.load(path, allow_pickle=False) as arrays:
+    with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as arrays:
         content = dict(arrays.items())
     if "points" not in content:
         raise ValueError("the archive has no array called 'points'")
@@ -252,7 +256,6 @@ _READERS = {
     "medit": lambda path, name: read_medit(path),
     "xdmf": lambda path, name: (read_xdmf(path), []),
     "exodus": lambda path, name: (read_exodus(path), []),
-    "nastran": _read_nastran,
     "ugrid": _read_ugrid,
     "npz": _read_npz,
 }

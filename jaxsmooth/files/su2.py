@@ -12,7 +12,7 @@ import meshio
 import numpy as np
 
 from jaxsmooth.elements import element_type
-from jaxsmooth.files.checks import parse_numbers
+from jaxsmooth.files.checks import check_last_line, parse_numbers
 from jaxsmooth.files.regions import recall
 
 __all__ = ["SU2_REST", "read_su2", "write_su2"]
@@ -31,10 +31,7 @@ def read_su2(path: Path) -> tuple[meshio.Mesh, list[str]]:
 
     Returns the mesh and notes.  Raises `ValueError` in one sentence."""
     text = path.read_text(encoding="utf-8", errors="replace")
-    if text.strip() and not text.endswith("\n") and not text.rstrip(" \t").endswith(("\n", "\r")):
-        raise ValueError(
-            "its last line has no end, so the file may be cut short; complete it or end the line"
-        )
+    check_last_line(text.encode(), b"%")
     lines = [s for line in text.splitlines() if (s := line.partition("%")[0].strip())]
     heads = [k for k, line in enumerate(lines) if "=" in line]
     dim, points, inside, outside = 0, None, [], []
@@ -65,14 +62,20 @@ def read_su2(path: Path) -> tuple[meshio.Mesh, list[str]]:
             raise ValueError("it has several zones; give each a file of its own")
         elif key != "NZONE":
             rest += lines[start:end]
-    if points is None or "NELEM" not in counts or not dim:
-        missing = "NDIME" if not dim else "NPOIN" if points is None else "NELEM"
-        raise ValueError(f"it has no section {missing}; {_CUT}")
-    if counts.get("NMARK", len(markers)) != len(markers) or not all(name in counts for name in markers):
-        complete = sum(name in counts for name in markers)
-        raise ValueError(
-            f"it has {complete} markers with elements, NMARK says {counts.get('NMARK', 0)}; {_CUT}"
+    if points is None or not dim or not {"NELEM", "NMARK"} <= counts.keys():
+        missing = (
+            "NDIME"
+            if not dim
+            else "NPOIN"
+            if points is None
+            else "NELEM"
+            if "NELEM" not in counts
+            else "NMARK"
         )
+        raise ValueError(f"it has no section {missing}; {_CUT}")
+    if counts["NMARK"] != len(markers) or not all(name in counts for name in markers):
+        complete = sum(name in counts for name in markers)
+        raise ValueError(f"it has {complete} markers with elements, NMARK says {counts['NMARK']}; {_CUT}")
     mesh = _mesh(points, inside, outside, markers)
     notes = []
     if rest:

@@ -7,6 +7,8 @@ from pathlib import Path
 import meshio
 import numpy as np
 
+from jaxsmooth.files.checks import check_last_line
+
 __all__ = ["is_text", "read_ugrid", "write_ugrid"]
 
 _SURFACE = {"triangle": 3, "quad": 4}
@@ -23,10 +25,7 @@ def is_text(path: Path) -> bool:
 def read_ugrid(path: Path) -> meshio.Mesh:
     """Nodes, boundary faces with their tags, and elements.  Raises `ValueError` in one sentence."""
     text = path.read_text()
-    if not text.endswith("\n"):
-        raise ValueError(
-            "its last line has no end, so the file may be cut short; complete it or end the line"
-        )
+    check_last_line(text.encode())
     numbers = np.array(text.split(), dtype=np.float64)
     if len(numbers) < 7 or (numbers[:7] < 0).any():
         raise ValueError("its first line does not have seven counts")

@@ -6,6 +6,8 @@ import re
 
 import meshio
 
+from jaxsmooth.files.checks import check_last_line
+
 __all__ = ["check_vtk", "check_vtu"]
 
 _CUT = "the file is damaged or cut short"
@@ -14,10 +16,8 @@ _CUT = "the file is damaged or cut short"
 def check_vtk(content: bytes, mesh: meshio.Mesh) -> None:
     """Raise `ValueError` where a legacy file has other counts than `mesh`, which meshio read from it."""
     lines = content[:4096].splitlines()
-    if len(lines) > 2 and lines[2].strip().upper() == b"ASCII" and not content.endswith(b"\n"):
-        raise ValueError(
-            "its last line has no end, so the file may be cut short; complete it or end the line"
-        )
+    if len(lines) > 2 and lines[2].strip().upper() == b"ASCII":
+        check_last_line(content)
     cells = sum(len(block) for block in mesh.cells)
     for key, found in (("POINTS", len(mesh.points)), ("CELL_TYPES", cells), ("CELL_DATA", cells)):
         said = _counts(content, key)
