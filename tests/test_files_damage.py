@@ -133,7 +133,7 @@ EDITS = [
     ("vtk42:ascii", "CELL_DATA 16", "CELL_DATA 8", "CELL_DATA says 8, the file has 16"),
     ("vtk:ascii", "CELL_TYPES 16", "CELL_TYPES 15", "Unknown section"),
     ("vtu", 'NumberOfCells="16"', 'NumberOfCells="17"', "damaged"),
-    ("vtu", 'NumberOfPoints="15"', 'NumberOfPoints="14"', "NumberOfPoints|damaged"),
+    ("vtu", 'NumberOfPoints="15"', 'NumberOfPoints="14"', "shape"),
     ("gmsh22:ascii", "$Nodes\n15\n", "$Nodes\n14\n", "more numbers than its counts"),
     ("gmsh22:ascii", "$Nodes\n15\n1 ", "$Nodes\n15\n0 ", "node with the tag 0"),
     ("gmsh22:ascii", "$Nodes\n15\n1 ", "$Nodes\n15\n-1 ", "node with the tag -1"),

@@ -319,8 +319,11 @@ def _sets(part: _Part, key: str, several: bool) -> Iterator[tuple[str, np.ndarra
 
 def _shown(part: _Part, key: str, name: str, several: bool) -> str:
     """The name that a set of a part has in the mesh: sets of an assembly may have the same."""
-    taken = name.upper() in (other.upper() for other in part.outer[key])
-    return f"{part.name}_{name}" if part.name and (several or taken) else name
+    own = next((other for other in part.sets[key] if other.upper() == name.upper()), None)
+    outer = next((other for other in part.outer[key] if other.upper() == name.upper()), None)
+    if own is None:
+        return outer or name
+    return f"{part.name}_{own}" if part.name and (several or outer) else own
 
 
 def _count_missing(notes: list[str], name: str, count: int) -> None:

@@ -272,7 +272,7 @@ def _entities(mesh: meshio.Mesh, points: np.ndarray) -> dict[tuple[int, int], di
         entity["box"] = (np.minimum(low, own.min(axis=0)), np.maximum(high, own.max(axis=0)))
         groups = [int(mesh.cell_data["gmsh:physical"][k][0])]
         several = (recall(mesh, GROUPS) or {}).get(key, [])
-        groups = several if groups[0] in several else groups
+        groups = list(several) if groups[0] in several else groups
         for name, value in mesh.field_data.items():  # an entity may be in several groups
             members = mesh.cell_sets.get(name)
             if np.shape(value) == (2,) and value[1] == cells.dim and members is not None and k < len(members):

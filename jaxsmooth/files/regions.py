@@ -341,7 +341,7 @@ def _division(sets: list[np.ndarray], signature: np.ndarray) -> list[np.ndarray]
         return None
 
     found = search(0)
-    return [sets[i][signature] for i in found] if found else None
+    return [sets[i][signature] for i in sorted(found)] if found else None
 
 
 def _bodies(cells, elements: _Elements, masks: list[np.ndarray]) -> list[np.ndarray]:
