@@ -327,7 +327,7 @@ def _shown(part: _Part, key: str, name: str, several: bool) -> str:
 
 
 def _count_missing(notes: list[str], name: str, count: int) -> None:
-    if count:
+    if count > 0:
         notes.append(f"{count} members of the Abaqus set {name} are not in the file")
 
 

@@ -82,8 +82,11 @@ def check_msh(content: bytes) -> None:
     nodes, elements = (_Section(content, name, binary, size) for name in ("Nodes", "Elements"))
     tags = _nodes2(nodes) if version[0] == "2" else _nodes4(nodes)
     _check_tags(tags)
-    known = np.unique(tags)
+    whole = tags[-1] - tags[0] == len(tags) - 1 and bool((np.diff(tags) == 1).all())  # the usual case
+    known = tags if whole else np.unique(tags)
     for used in _elements2(elements) if version[0] == "2" else _elements4(elements):
+        if whole and used.size and used.min() >= known[0] and used.max() <= known[-1]:
+            continue
         at = np.minimum(np.searchsorted(known, used), len(known) - 1)
         missing = known[at] != used
         if missing.any():
@@ -98,7 +101,7 @@ def _check_tags(tags: np.ndarray) -> None:
         raise ValueError("it has no nodes")
     if tags.min() < 1:
         raise ValueError(f"it has a node with the tag {tags.min()}; tags of nodes are counted from 1")
-    if len(np.unique(tags)) < len(tags):
+    if not (np.diff(tags) > 0).all() and len(np.unique(tags)) < len(tags):
         values, times = np.unique(tags, return_counts=True)
         raise ValueError(f"it has two nodes with the tag {values[times > 1][0]}; {_CUT}")
 

@@ -206,7 +206,7 @@ def _elements(cells, parts, kept) -> _Elements:
             element = np.arange(sum(sizes)) + first
         else:
             nodes = np.concatenate([np.asarray(cells[k][1]) for k in own])
-            same = np.unique(np.sort(nodes, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
+            same = _numbered(np.sort(nodes, axis=1))
             number = np.full(len(nodes), -1, np.int64)
             number[same[rows]] = np.arange(len(rows)) + first
             element = number[same]
@@ -259,7 +259,8 @@ def _combinations(element: np.ndarray, values: np.ndarray, count: int) -> np.nda
     region[element] = values
     if (region[element] == values).all():  # the usual case: one value each
         return region
-    pairs = np.unique(np.stack([element, values], axis=1)[values != 0], axis=0)  # 0 is no group
+    pairs = np.stack([element, values], axis=1)[values != 0]  # 0 is no group
+    pairs = pairs[np.unique(_numbered(pairs), return_index=True)[1]]
     sizes = np.bincount(pairs[:, 0], minlength=count)
     starts = np.cumsum(sizes) - sizes
     region[pairs[:, 0]] = pairs[:, 1]
@@ -268,8 +269,17 @@ def _combinations(element: np.ndarray, values: np.ndarray, count: int) -> np.nda
         columns = np.arange(sizes.max())
         at = np.minimum(starts[several, None] + columns, len(pairs) - 1)
         table = np.where(columns < sizes[several, None], pairs[at, 1], 0)
-        region[several] = values.max() + 1 + np.unique(table, axis=0, return_inverse=True)[1].reshape(-1)
+        region[several] = values.max() + 1 + _numbered(table)
     return region
+
+
+def _numbered(table: np.ndarray) -> np.ndarray:
+    """For every row its number among the distinct ones in order; NumPy's own way takes 20 times longer."""
+    number = np.zeros(len(table), np.int64)
+    for column in np.packbits(table, axis=1).T if table.dtype == bool else table.T:
+        values, place = np.unique(column, return_inverse=True)
+        number = np.unique(number * len(values) + place.reshape(-1), return_inverse=True)[1].reshape(-1)
+    return number
 
 
 # --- Sets ---------------------------------------------------------------------------------
@@ -285,8 +295,8 @@ def _by_sets(source: meshio.Mesh, cells, elements: _Elements) -> np.ndarray | No
     masks = [m for m in masks if m.any() and not m.all()]
     if not masks:
         return None
-    table, signature = np.unique(np.stack(masks, axis=1), axis=0, return_inverse=True)
-    signature = signature.reshape(-1)
+    signature = _numbered(np.stack(masks, axis=1))
+    table = np.stack(masks, axis=1)[np.unique(signature, return_index=True)[1]]
     sets = list({column.tobytes(): column for column in table.T}.values())
     kinds = _type_sets(elements)
     by_type = [any((s[signature] == kind).all() for kind in kinds) for s in sets]
@@ -300,7 +310,7 @@ def _by_sets(source: meshio.Mesh, cells, elements: _Elements) -> np.ndarray | No
     bodies = _bodies(cells, elements, masks)
     if not bodies:
         return None
-    return np.unique(np.stack(bodies, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
+    return _numbered(np.stack(bodies, axis=1))
 
 
 def _type_sets(elements: _Elements) -> list[np.ndarray]:
