@@ -13,7 +13,7 @@ import pytest
 
 import jaxsmooth.io as jsio
 from jaxsmooth.elements import element_type, supported
-from jaxsmooth.files.formats import EXODUS_ORDER, extend_exodus
+from jaxsmooth.files.exodus import EXODUS_ORDER, extend_exodus
 from jaxsmooth.io import MeshFileError, check_output, read, write
 from jaxsmooth.meshfile import from_meshio
 
@@ -166,7 +166,7 @@ def test_exodus_order_of_mid_side_nodes(tmp_path, name):
 def test_exodus_blocks_are_materials(tmp_path):
     source = sample("tetra")
     source.cells = [meshio.CellBlock("tetra", source.cells[0].data[k]) for k in ([0, 1], [2])]
-    source.cell_data = {}
+    source.cell_data = {"ElementBlockIds": [np.array([1, 1]), np.array([2])]}
     _, again, notes = round_trip(tmp_path, source, "a.e")
     assert list(again.mesh.labels.regions[0]) == [1, 1, 2]
     assert notes == ()
@@ -503,7 +503,7 @@ def test_abaqus_sets_types_and_numbers(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ("type=c3d5", "type=COH3D8", "element type COH3D8"),
+        ("type=c3d5", "type=COH3D8P", "element type COH3D8P"),
         ("*Heading", "*Part, name=a\n*Part, name=b", r"more than one \*PART"),
         ("40, 50\n", "40\n", "don't have 5 nodes"),
         ("7, 10, 20, 40, 60", "7, 10, 20, 40, 99", "cell 1 .*node -1.*out of range"),

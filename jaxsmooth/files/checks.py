@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,10 +15,13 @@ __all__ = [
     "SYNONYMS",
     "MeshFileError",
     "check_cells",
+    "check_last_line",
     "check_points",
+    "check_references",
     "dimension",
     "element_dim",
     "in_plane",
+    "parse_numbers",
 ]
 
 # meshio refuses to build cells of a type whose dimension it doesn't list.  These gaps of its
@@ -117,6 +121,24 @@ def check_cells(cells: Sequence[tuple[str, Any]], chosen: Sequence[int], count: 
             )
 
 
+def check_references(mesh: Any) -> None:
+    """Raise `ValueError` where cells below the highest dimension refer to nodes that aren't there.
+
+    `check_cells` does it for the highest, which are checked for more than that."""
+    top = max((dimension(cells.type) for cells in mesh.cells if len(cells)), default=0)
+    for k, cells in enumerate(mesh.cells):
+        if not len(cells) or dimension(cells.type) == top or cells.type not in (*TYPES, "vertex"):
+            continue
+        nodes = np.ma.filled(cells.data, -1)
+        outside = (nodes < 0) | (nodes >= len(mesh.points))
+        if outside.any():
+            row = int(np.argwhere(outside)[0, 0])
+            raise ValueError(
+                f"{cells.type} {row} of cell block {k} (counted from 0) refers to a node that is out of "
+                f"range (the file has {len(mesh.points)} nodes); repair the connectivity"
+            )
+
+
 def _cell(first: np.ndarray, block: int, row: int, name: str) -> str:
     return f"cell {first[block] + row} of the file ({name} {row} of cell block {block}, counted from 0)"
 
@@ -135,3 +157,22 @@ def in_plane(points: np.ndarray, numbering: Sequence[np.ndarray], dim: int) -> n
             "give volume elements, or a plane mesh in x and y"
         )
     return points[:, :2]
+
+
+def check_last_line(content: bytes, comment: bytes = b"#") -> None:
+    """Raise `ValueError` where a text file ends within a line, so that its last number may be cut."""
+    last = content.replace(b"\r", b"\n").rpartition(b"\n")[2].strip()
+    if last and not last.startswith(comment):
+        raise ValueError(
+            "its last line has no end, so the file may be cut short; complete it or end the line"
+        )
+
+
+def parse_numbers(text: str | bytes, place: str, dtype: Any = np.float64) -> np.ndarray:
+    """Numbers with blanks between them; raises `ValueError` that names the place for anything else."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)  # how NumPy says it before 2.3
+            return np.fromstring(text, dtype=dtype, sep=" ")
+    except (DeprecationWarning, ValueError) as error:
+        raise ValueError(f"{place} has something that is not a number") from error

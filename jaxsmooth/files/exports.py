@@ -3,28 +3,36 @@
 from __future__ import annotations
 
 import copy
+import importlib.util
 from collections.abc import Iterable
 from pathlib import Path
 
 import meshio
 import numpy as np
+from meshio._helpers import _writer_map, reader_map
 
 from jaxsmooth.elements import supported
-from jaxsmooth.files.abaqus import write_abaqus
-from jaxsmooth.files.formats import (
-    EXODUS_BLOCKS,
-    EXODUS_ORDER,
-    MEDIT_SETS,
-    extend_exodus,
-    quiet,
-    stem_format,
-)
-from jaxsmooth.files.labels import REGION_NAMES, is_mask, plain
+from jaxsmooth.files.abaqus import ABAQUS_TYPES, write_abaqus
+from jaxsmooth.files.checks import SYNONYMS, MeshFileError
+from jaxsmooth.files.exodus import write_exodus
+from jaxsmooth.files.formats import quiet, read_format, stem_format
+from jaxsmooth.files.medit import MEDIT_SETS, append_medit_sets
 from jaxsmooth.files.msh import split_by_entity, write_data_sections, write_msh41
-from jaxsmooth.files.su2 import write_su2
-from jaxsmooth.meshfile import MeshFileError
+from jaxsmooth.files.reduction import (
+    DATA_FORMATS,
+    GMSH_TAGS,
+    VTK_FORMATS,
+    add_materials,
+    as_tags,
+    material_name,
+    reduce_data,
+    sets_to_data,
+)
+from jaxsmooth.files.regions import NOT_SETS, SECTIONS, plain, recall
+from jaxsmooth.files.su2 import SU2_REST, write_su2
+from jaxsmooth.files.ugrid import is_text, write_ugrid
 
-__all__ = ["check_types", "write_source"]
+__all__ = ["check_types", "check_writable", "write_source"]
 
 _LINEAR = {"line", "triangle", "quad", "tetra", "wedge", "pyramid", "hexahedron"}
 _HOLDS = {
@@ -39,15 +47,38 @@ _HOLDS = {
 """Cell types of formats that hold only some of those that this package knows."""
 
 _SURFACES = {"stl", "obj", "off", "ply", "svg", "wkt", "neuroglancer"}
-_VTK = {"vtk", "vtk42", "vtu"}
-_DATA = {*_VTK, "xdmf", "gmsh", "gmsh22", "npz"}  # hold any point and cell data
-_GMSH_TAGS = ("gmsh:physical", "gmsh:geometrical")
-_SPECIAL = ("gmsh:bounding_entities",)
+_ONE_BLOCK = {"med", "hmf", "h5m"}  # of a type
+_SEVERAL_FILES = {"tetgen": ".node and .ele", "dolfin-xml": "one for every data array"}
+_NEEDS = {"exodus": "netCDF4", "med": "h5py", "h5m": "h5py", "hmf": "h5py", "cgns": "h5py", "xdmf": "h5py"}
+
+
+def check_writable(format: str) -> None:
+    """Raise `MeshFileError` where nothing here writes a format, or a package for it is missing."""
+    stem = stem_format(format)
+    if stem not in _writer_map and stem not in _WRITERS:
+        raise MeshFileError(f"nothing writes {stem} files; write .vtu, .msh or .xdmf instead")
+    if stem in _SEVERAL_FILES:
+        raise MeshFileError(
+            f"{stem} meshes are several files ({_SEVERAL_FILES[stem]}), which are not written; "
+            "write .vtu or .msh instead"
+        )
+    if (package := _NEEDS.get(stem)) and importlib.util.find_spec(package) is None:
+        raise MeshFileError(
+            f"writing {stem} files needs {package}; install it with: pip install 'jaxsmooth[io]'"
+        )
 
 
 def check_types(names: Iterable[str], path: Path, format: str) -> None:
-    """Raise `MeshFileError` where a format can't hold elements of these types."""
+    """Raise `MeshFileError` where a format can't be written, or can't hold elements of these types."""
     stem = stem_format(format)
+    try:
+        check_writable(format)
+    except MeshFileError as error:
+        raise MeshFileError(f"{path}: {error}") from None
+    if stem == "ugrid" and not is_text(Path(path)):
+        raise MeshFileError(
+            f"{path}: ugrid files are written as text, and this name says binary; name it .ugrid"
+        )
     if stem in _SURFACES:
         raise MeshFileError(f"{path}: {stem} files hold surfaces only; write .vtu, .msh or .xdmf instead")
     missing = [n for n in names if stem in _HOLDS and n in supported() and n not in _HOLDS[stem]]
@@ -71,18 +102,20 @@ def write_source(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> list[s
     """
     stem, notes = stem_format(format), []
     mesh = _clean(mesh, stem, dim, notes)
+    if stem != "abaqus":
+        add_materials(mesh, stem, dim, notes)
     own_sets = {}
     if stem == "medit" and path.suffix == ".mesh":
         own_sets = {name: mesh.point_sets.pop(name) for name in MEDIT_SETS if name in mesh.point_sets}
     if stem not in ("abaqus", "exodus", "su2") and (mesh.point_sets or mesh.cell_sets or mesh.field_data):
-        _sets_to_data(mesh, stem, notes)
-    if stem not in _DATA:
-        _reduce_data(mesh, stem, dim, notes)
+        sets_to_data(mesh, stem, notes)
+    if stem not in DATA_FORMATS:
+        reduce_data(mesh, stem, dim, notes)
     try:
         with quiet() as said:
-            _WRITERS.get(stem, _write_any)(path, mesh, format)
+            notes += _WRITERS.get(stem, _write_rare)(path, mesh, format, dim) or []
             if own_sets:
-                _append_medit_sets(path, own_sets)
+                append_medit_sets(path, own_sets)
     except ModuleNotFoundError as error:
         raise MeshFileError(
             f"{path}: writing {stem} files needs {error.name}; install it with: pip install 'jaxsmooth[io]'"
@@ -114,7 +147,7 @@ def _clean(mesh: meshio.Mesh, stem: str, dim: int, notes: list[str]) -> meshio.M
     out.points = plain(mesh.points)
     if stem == "su2" and dim == 2:  # its dimension is the number of coordinates
         out.points = out.points[:, :2]
-    elif stem in (*_VTK, "xdmf", "gmsh22", "abaqus") and out.points.shape[1] == 2:
+    elif stem in (*VTK_FORMATS, "xdmf", "gmsh22", "abaqus") and out.points.shape[1] == 2:
         out.points = np.pad(out.points, ((0, 0), (0, 1)))
     # a mixture of types may differ in dtype from block to block
     out.cell_data = {}
@@ -135,7 +168,16 @@ def _clean(mesh: meshio.Mesh, stem: str, dim: int, notes: list[str]) -> meshio.M
         name: [members[k] if k < len(members) else None for k in kept]
         for name, members in mesh.cell_sets.items()
     }
+    if stem != "gmsh":  # Gmsh's own, of 4.1
+        out.cell_sets = {name: members for name, members in out.cell_sets.items() if name not in NOT_SETS}
     out.point_sets, out.field_data = dict(mesh.point_sets), dict(mesh.field_data)
+    if isinstance(mesh.info, dict):
+        by_block = {key: mesh.info[key] for key in (SECTIONS, ABAQUS_TYPES) if key in mesh.info}
+        out.info = mesh.info | {key: [parts[k] for k in kept] for key, parts in by_block.items()}
+    if stem != "su2" and recall(mesh, SU2_REST):
+        notes.append(
+            f"{stem} files have no place for the other sections of the SU2 file; they are not written"
+        )
     return out
 
 
@@ -149,194 +191,117 @@ def _array(values, stem: str) -> np.ndarray | None:
         values = values.astype(np.float64)
     if values.ndim > 2 or (values.ndim == 2 and values.shape[1] == 1):
         values = values.reshape(len(values), -1) if values.size != len(values) else values.ravel()
-    if stem in _VTK and values.ndim == 2 and values.shape[1] == 2:
+    if stem in VTK_FORMATS and values.ndim == 2 and values.shape[1] == 2:
         values = np.pad(values, ((0, 0), (0, 1)))  # VTK's vectors have three components
     return values
-
-
-def _masks(mesh: meshio.Mesh) -> tuple[dict[str, np.ndarray], dict[str, list[np.ndarray]]]:
-    """All sets as 0/1 data: of points, and of cells (cell sets and Gmsh's physical names)."""
-    of_points, of_cells = {}, {}
-    for name, members in mesh.point_sets.items():
-        of_points[name] = mask = np.zeros(len(mesh.points), np.int32)
-        members = np.asarray(members)
-        mask[members if members.dtype == bool else members.astype(np.int64)] = 1
-    for name, members in mesh.cell_sets.items():
-        if name in _SPECIAL:
-            continue
-        of_cells[name] = [np.zeros(len(cells), np.int32) for cells in mesh.cells]
-        for mask, rows in zip(of_cells[name], members, strict=True):
-            if rows is not None and len(rows):
-                rows = np.asarray(rows)
-                mask[rows if rows.dtype == bool else rows.astype(np.int64)] = 1
-    physical = mesh.cell_data.get("gmsh:physical")
-    for name, entry in mesh.field_data.items():
-        if physical is not None and np.shape(entry) == (2,) and name not in of_cells:
-            of_cells[name] = [
-                ((tags == entry[0]) & (cells.dim == entry[1])).astype(np.int32)
-                for cells, tags in zip(mesh.cells, physical, strict=True)
-            ]
-    return of_points, of_cells
-
-
-def _sets_to_data(mesh: meshio.Mesh, stem: str, notes: list[str]) -> None:
-    """Turn sets into 0/1 data under their names; Gmsh keeps its physical names as they are."""
-    of_points, of_cells = _masks(mesh)
-    if stem in ("gmsh", "gmsh22"):
-        of_cells = {name: masks for name, masks in of_cells.items() if name not in mesh.field_data}
-    else:
-        mesh.field_data = {}
-    mesh.point_sets = {}
-    mesh.cell_sets = {k: v for k, v in mesh.cell_sets.items() if k in _SPECIAL or k in mesh.field_data}
-    names = [*of_points, *of_cells]
-    if not names:
-        return
-    if stem not in _DATA:
-        notes.append(f"{stem} files hold no named sets; not written: {', '.join(names)}")
-        return
-    for name, mask in of_points.items():
-        mesh.point_data[_free(name, mesh.point_data)] = mask
-    for name, masks in of_cells.items():
-        mesh.cell_data[_free(name, mesh.cell_data)] = masks
-    notes.append(f"{stem} files hold no named sets; written as data of 0 and 1: {', '.join(names)}")
-
-
-def _free(name: str, taken) -> str:
-    while name in taken:
-        name += "_set"
-    return name
-
-
-def _reduce_data(mesh: meshio.Mesh, stem: str, dim: int, notes: list[str]) -> None:
-    """Keep what formats without free data can hold: material tags, and sets where there are some."""
-    lost = [*mesh.point_data, *mesh.cell_data]
-    if stem == "abaqus":
-        lost = _data_to_sets(mesh)
-    elif stem == "exodus":
-        lost = [name for name in mesh.cell_data if name != EXODUS_BLOCKS]
-        mesh.cell_data = {}
-        if mesh.cell_sets or mesh.field_data:
-            lost += [name for name in (*mesh.cell_sets, *mesh.field_data) if name not in _SPECIAL]
-    elif stem in ("medit", "su2"):
-        named = _masks(mesh)[1]  # before the tags that they come from go
-        own = f"{stem}:{'ref' if stem == 'medit' else 'tag'}"
-        name = next((n for n in (own, *REGION_NAMES) if _is_tag(mesh.cell_data.get(n))), None)
-        mesh.cell_data = {own: mesh.cell_data[name]} if name else {}
-        values = mesh.point_data.get("medit:ref")
-        mesh.point_data = {"medit:ref": values} if stem == "medit" and _is_tag([values]) else {}
-        lost = [n for n in lost if n not in (name, "medit:ref")]
-        if stem == "su2":  # markers are cell sets of the boundary
-            mesh.cell_sets = {n: [np.flatnonzero(m) for m in ms] for n, ms in named.items()}
-            top = [k for k, cells in enumerate(mesh.cells) if cells.dim == dim]
-            lost += [n for n, ms in mesh.cell_sets.items() if any(len(ms[k]) for k in top)]
-            lost += list(mesh.point_sets)
-    else:
-        return  # meshio knows best; what it leaves out differs from format to format
-    lost = [n for n in lost if n != "gmsh:dim_tags"]
-    if lost:
-        notes.append(f"{stem} files can't hold these data, which are not written: {', '.join(lost)}")
-
-
-def _is_tag(parts) -> bool:
-    return parts is not None and all(p is not None and p.dtype.kind in "iu" and p.ndim == 1 for p in parts)
-
-
-def _data_to_sets(mesh: meshio.Mesh) -> list[str]:
-    """Masks and material tags become sets; returns the names of data that can't."""
-    lost = []
-    _, named = _masks(mesh)
-    mesh.cell_sets = {name: [np.flatnonzero(mask) for mask in masks] for name, masks in named.items()}
-    for name, values in mesh.point_data.items():
-        if is_mask(values):
-            mesh.point_sets.setdefault(name, np.flatnonzero(values))
-        else:
-            lost.append(name)
-    covered = bool(named)
-    for name, parts in mesh.cell_data.items():
-        if name in REGION_NAMES and _is_tag(parts):
-            tags = np.unique(np.concatenate(parts))
-            if (covered and name in _GMSH_TAGS) or not tags.any():
-                continue
-            for tag in tags:
-                members = [np.flatnonzero(part == tag) for part in parts]
-                mesh.cell_sets.setdefault(f"{name.replace(':', '_')}_{tag}", members)
-            covered = True
-        elif all(is_mask(part) for part in parts):
-            mesh.cell_sets.setdefault(name, [np.flatnonzero(part) for part in parts])
-        else:
-            lost.append(name)
-    return lost
 
 
 # --- Writers -----------------------------------------------------------------------------
 
 
-def _write_any(path: Path, mesh: meshio.Mesh, format: str) -> None:
+def _write_any(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> None:
     meshio.write(path, mesh, file_format=stem_format(format))
 
 
-def _write_vtk(path: Path, mesh: meshio.Mesh, format: str) -> None:
+def _write_rare(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> list[str]:
+    """Formats whose writers leave out cells or data without a word: what they wrote is read again.
+
+    Returns notes on what is missing then."""
+    stem = stem_format(format)
+    if stem in _ONE_BLOCK:
+        _merge_blocks(mesh)
+    said = dict.fromkeys((*mesh.point_data, *mesh.cell_data))
+    if stem == "h5m":  # fails with any
+        mesh.cell_data = {}
+    material = material_name(mesh, dim)
+    meshio.write(path, mesh, file_format=stem)
+    if stem not in reader_map:
+        return []
+    again = read_format(path, stem)
+    if len(again.points) != len(mesh.points) or _sizes(again) != _sizes(mesh):
+        raise ValueError(f"it would have {_sizes(again)} instead of {_sizes(mesh)}")
+    kept = {*again.point_data, *again.cell_data, "gmsh:dim_tags"}
+    if material_name(again, dim):
+        kept.add(material)
+    lost = [name for name in said if name not in kept]
+    return [f"{stem} files can't hold these data, which are not written: {', '.join(lost)}"] if lost else []
+
+
+def _sizes(mesh: meshio.Mesh) -> str:
+    sizes: dict[str, int] = {}
+    for cells in mesh.cells:
+        name = SYNONYMS.get(cells.type, cells.type)
+        sizes[name] = sizes.get(name, 0) + len(cells)
+    return ", ".join(f"{n} {name}" for name, n in sorted(sizes.items())) or "no cells"
+
+
+def _merge_blocks(mesh: meshio.Mesh) -> None:
+    """One cell block a type."""
+    parts = {c.type: [k for k, o in enumerate(mesh.cells) if o.type == c.type] for c in mesh.cells}
+    mesh.cell_data = {
+        name: [np.concatenate([values[k] for k in own]) for own in parts.values()]
+        for name, values in mesh.cell_data.items()
+    }
+    mesh.cells = [
+        meshio.CellBlock(kind, np.concatenate([mesh.cells[k].data for k in own]))
+        for kind, own in parts.items()
+    ]
+
+
+def _write_vtk(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> None:
     mesh.point_data = {name.replace(" ", "_"): v for name, v in mesh.point_data.items()}
     mesh.cell_data = {name.replace(" ", "_"): v for name, v in mesh.cell_data.items()}
     meshio.write(path, mesh, file_format=stem_format(format), binary=not format.endswith(":ascii"))
 
 
-def _write_xdmf(path: Path, mesh: meshio.Mesh, format: str) -> None:
+def _write_xdmf(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> None:
     # one file: a companion .h5 could not be renamed together with it
     meshio.write(path, mesh, file_format="xdmf", data_format="XML")
 
 
-def _write_gmsh(path: Path, mesh: meshio.Mesh, format: str) -> None:
+def _write_gmsh(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> None:
     binary = not format.endswith(":ascii")
-    _tag(mesh)
+    _tag(mesh, dim)
     if stem_format(format) == "gmsh":
         write_msh41(path, split_by_entity(mesh), binary)
         return
     bare = copy.copy(mesh)
     bare.points = mesh.points.astype(np.float64)
-    bare.point_data, bare.cell_data = {}, {name: mesh.cell_data[name] for name in _GMSH_TAGS}
+    bare.point_data, bare.cell_data = {}, {name: mesh.cell_data[name] for name in GMSH_TAGS}
     meshio.write(path, bare, file_format="gmsh22", binary=binary)
     write_data_sections(path, mesh, binary)
 
 
-def _tag(mesh: meshio.Mesh) -> None:
+def _tag(mesh: meshio.Mesh, dim: int) -> None:
     """Both of Gmsh's tags for all cells; other material tags are physical groups to it."""
     if "gmsh:physical" not in mesh.cell_data:
-        name = next((n for n in REGION_NAMES if _is_tag(mesh.cell_data.get(n))), None)
+        name = material_name(mesh, dim)
         zero = [np.zeros(len(cells), np.int32) for cells in mesh.cells]
-        mesh.cell_data["gmsh:physical"] = zero if name in (None, *_GMSH_TAGS) else mesh.cell_data[name]
+        used = name not in (None, *GMSH_TAGS)
+        mesh.cell_data["gmsh:physical"] = as_tags(mesh.cell_data[name]) if used else zero
     if "gmsh:geometrical" not in mesh.cell_data:
         mesh.cell_data["gmsh:geometrical"] = mesh.cell_data["gmsh:physical"]
-    for name in _GMSH_TAGS:
+    for name in GMSH_TAGS:
         mesh.cell_data[name] = [part.astype(np.int32) for part in mesh.cell_data[name]]
 
 
-def _write_abaqus(path: Path, mesh: meshio.Mesh, format: str) -> None:
+def _write_abaqus(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> None:
     write_abaqus(path, mesh)
 
 
-def _write_su2(path: Path, mesh: meshio.Mesh, format: str) -> None:
+def _write_su2(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> None:
     write_su2(path, mesh)
 
 
-def _write_exodus(path: Path, mesh: meshio.Mesh, format: str) -> None:
-    extend_exodus()
-    mesh.cells = [
-        meshio.CellBlock(c.type, c.data[:, EXODUS_ORDER[c.type]]) if c.type in EXODUS_ORDER else c
-        for c in mesh.cells
-    ]
-    meshio.write(path, mesh, file_format="exodus")
+def _write_exodus(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> None:
+    write_exodus(path, mesh, next(iter(mesh.cell_data), None))
 
 
-def _append_medit_sets(path: Path, sets: dict[str, np.ndarray]) -> None:
-    text = path.read_text().rstrip().removesuffix("End")
-    for name, members in sets.items():
-        numbers = "\n".join(map(str, (np.asarray(members, dtype=np.int64) + 1).tolist()))
-        text += f"{name}\n{len(members)}\n{numbers}\n"
-    path.write_text(text + "\nEnd\n")
+def _write_ugrid(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> None:
+    write_ugrid(path, mesh)
 
 
-def _write_npz(path: Path, mesh: meshio.Mesh, format: str) -> None:
+def _write_npz(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> None:
     arrays = {"points": mesh.points, **mesh.point_data}
     for name in dict.fromkeys(cells.type for cells in mesh.cells):
         own = [k for k, cells in enumerate(mesh.cells) if cells.type == name]
@@ -348,6 +313,8 @@ def _write_npz(path: Path, mesh: meshio.Mesh, format: str) -> None:
 
 
 _WRITERS = {
+    "vtu": _write_any,
+    "medit": _write_any,
     "vtk": _write_vtk,
     "vtk42": _write_vtk,
     "xdmf": _write_xdmf,
@@ -356,5 +323,6 @@ _WRITERS = {
     "abaqus": _write_abaqus,
     "exodus": _write_exodus,
     "su2": _write_su2,
+    "ugrid": _write_ugrid,
     "npz": _write_npz,
 }

@@ -9,60 +9,28 @@ import meshio
 import numpy as np
 
 from jaxsmooth.elements import TYPES
+from jaxsmooth.files.regions import (
+    NOT_SETS,
+    REGION_NAMES,
+    find_regions,
+    folded,
+    members_of,
+    plain,
+    recall,
+    region_arrays,
+)
 from jaxsmooth.mesh import Labels
 
-__all__ = ["REGION_NAMES", "held_nodes", "make_labels", "make_named_sets", "plain"]
-
-REGION_NAMES = (
-    "gmsh:physical",
-    "gmsh:geometrical",
-    "medit:ref",
-    "su2:tag",
-    "nastran:ref",
-    "netgen:index",
-    "tetgen:ref",
-    "ugrid:ref",
-    "avsucd:material",
-    "flac3d:group",
-    "cell_tags",
-    "material",
-    "materials",
-    "materialid",
-    "materialids",
-    "matid",
-    "mat",
-    "region",
-    "regions",
-    "regionid",
-    "regionids",
-    "subdomain",
-    "subdomains",
-    "domain",
-    "domains",
-    "attribute",
-    "attributes",
-    "physical",
-    "physicalids",
-    "elementblockids",
-    "blockid",
-    "partid",
-    "group",
-    "groups",
-    "groupid",
-)
-"""Cell data taken for material tags, first match first; case, ``_``, ``-`` and blanks don't count."""
-
-_NOT_SETS = ("gmsh:bounding_entities",)
+__all__ = ["HELD", "held_nodes", "is_mask", "make_labels", "make_named_sets", "plain"]
 
 
-def plain(array: Any) -> np.ndarray:
-    """An ordinary array in native byte order; readers return masked and big-endian ones.
+HELD_SETS = ("fixed", "requiredvertices", "corners")
+"""Names (in any case) of sets whose nodes are held: this package's own, and Medit's two."""
 
-    Masked floats become NaN, so that the checks find them."""
-    if isinstance(array, np.ma.MaskedArray):
-        array = array.filled(np.nan if array.dtype.kind == "f" else -1)
-    array = np.asarray(array)
-    return array.astype(array.dtype.newbyteorder("="), copy=False)
+_FOLDED = {folded(name) for name in REGION_NAMES}
+
+HELD = "medit:held"
+"""In `meshio.Mesh.info`: nodes that required edges and faces of a Medit file hold."""
 
 
 def make_labels(
@@ -76,20 +44,10 @@ def make_labels(
 
     Element block b is made of the source's cell blocks ``parts[b]``, of which it has rows ``kept[b]``.
 
-    A tag of 0 everywhere says nothing, so the next array of `REGION_NAMES` is asked; without any,
-    cell sets that divide the elements among them (Abaqus' way to assign materials) are regions."""
-    inside = sorted(k for own in parts for k in own)
+    `jaxsmooth.files.regions` says what makes a region."""
     lower = [
         k for k, (name, data) in enumerate(cells) if len(data) and (name == "vertex" or _lower(name, dim))
     ]
-    tags = _tags(source, inside)
-    if tags is None:
-        tags = _partition(source, inside)
-    if tags is None:
-        tags = {k: np.zeros(len(cells[k][1]), np.int64) for k in inside}
-    regions = tuple(
-        np.concatenate([tags[k] for k in own])[rows] for own, rows in zip(parts, kept, strict=True)
-    )
     features: list[int] = []
     feature_tags: dict[int, np.ndarray] = {}
     for d in range(dim):
@@ -100,7 +58,7 @@ def make_labels(
             feature_tags[k] = np.zeros(len(cells[k][1]), np.int64) if found is None else found[k]
     features.sort()
     return Labels(
-        regions=regions,
+        regions=tuple(find_regions(source, cells, parts, kept)),
         features=tuple(np.asarray(cells[k][1]).astype(np.int64) for k in features),
         feature_tags=tuple(feature_tags[k] for k in features),
         feature_types=tuple(cells[k][0] for k in features),
@@ -111,67 +69,20 @@ def _lower(name: str, dim: int) -> bool:
     return name in TYPES and TYPES[name].dim < dim
 
 
-def _folded(name: str) -> str:
-    return name.lower().replace("_", "").replace("-", "").replace(" ", "")
-
-
 def _tags(source: meshio.Mesh, blocks: Sequence[int]) -> dict[int, np.ndarray] | None:
-    """Tags of these cell blocks: the first array of `REGION_NAMES` that has some."""
-    if not blocks:
-        return None
-    folded = {_folded(name): name for name in source.cell_data}
-    for wanted in REGION_NAMES:
-        name = folded.get(_folded(wanted))
-        if name is None:
-            continue
-        arrays = {k: plain(source.cell_data[name][k]) for k in blocks}
-        arrays = {k: a[:, 0] if a.ndim == 2 and a.shape[1] == 1 else a for k, a in arrays.items()}
-        if any(a.ndim != 1 or a.dtype.kind not in "iufb" for a in arrays.values()):
-            continue
-        joined = np.concatenate(list(arrays.values()))
-        if not np.isfinite(joined).all() or (joined != np.round(joined)).any() or not joined.any():
-            continue
-        return {k: a.astype(np.int64) for k, a in arrays.items()}
+    """Tags of lower-dimensional cells: the first array that has any."""
+    for _, tags in region_arrays(source, blocks):
+        if any(t.any() for t in tags.values()):
+            return tags
     return None
 
 
-def _partition(source: meshio.Mesh, blocks: Sequence[int]) -> dict[int, np.ndarray] | None:
-    """Regions from two or more cell sets that divide all elements of these blocks among them."""
-    sizes = [len(source.cells[k]) for k in blocks]
-    starts = np.cumsum([0, *sizes])
-    region = np.full(starts[-1], -1, np.int64)
-    sets = []
-    for name, members in source.cell_sets.items():
-        if name in _NOT_SETS:
-            continue
-        chosen = [
-            starts[i] + m for i, k in enumerate(blocks) if (m := _members(members, k)) is not None and len(m)
-        ]
-        if chosen:
-            sets.append(np.concatenate(chosen))
-    used = 0
-    for members in sorted(sets, key=len, reverse=True):
-        if len(members) < len(region) and (region[members] < 0).all():
-            region[members] = used
-            used += 1
-    if used < 2 or (region < 0).any():
-        return None
-    return dict(zip(blocks, np.split(region, starts[1:-1]), strict=True))
-
-
-def _members(members: Any, block: int) -> np.ndarray | None:
-    """Cells of one block in a cell set, as integers; None where the set has no entry for it."""
-    if block >= len(members) or members[block] is None:
-        return None
-    rows = np.asarray(members[block])
-    if rows.dtype == bool:
-        rows = np.flatnonzero(rows)
-    return rows.astype(np.int64).ravel()
-
-
 def held_nodes(source: meshio.Mesh, count: int) -> np.ndarray:
-    """Nodes ``[nodes]`` that point data, cell data (where not zero) or a set called ``fixed`` chooses."""
+    """Nodes ``[nodes]`` that the file marks: point data, cell data (where not zero) or a set called
+    ``fixed``, and Medit's corners, required vertices, edges and faces."""
     held = np.zeros(count, bool)
+    if (required := recall(source, HELD)) is not None:
+        held[required] = True
     for name, values in source.point_data.items():
         if name.lower() == "fixed":
             held |= _nonzero(values)
@@ -180,7 +91,7 @@ def held_nodes(source: meshio.Mesh, count: int) -> np.ndarray:
             for cells, values in zip(source.cells, parts, strict=True):
                 held |= _nodes_of(cells, _nonzero(values), count)
     for name, mask in _all_sets(source, count):
-        if name.lower() == "fixed":
+        if name.lower() in HELD_SETS:
             held |= mask
     return held
 
@@ -216,11 +127,11 @@ def _all_sets(source: meshio.Mesh, count: int) -> Iterator[tuple[str, np.ndarray
         mask[members.ravel() if members.dtype == bool else members.astype(np.int64).ravel()] = True
         yield str(name), mask
     for name, members in source.cell_sets.items():
-        if name in _NOT_SETS:
+        if name in NOT_SETS:
             continue
         mask = np.zeros(count, bool)
         for k, cells in enumerate(source.cells):
-            rows = _members(members, k)
+            rows = members_of(members, k)
             if rows is not None and len(rows):
                 mask |= _nodes_of(cells, rows, count)
         yield str(name), mask
@@ -229,7 +140,7 @@ def _all_sets(source: meshio.Mesh, count: int) -> Iterator[tuple[str, np.ndarray
         if is_mask(values):
             yield name, _nonzero(values)
     for name, parts in source.cell_data.items():
-        if name not in REGION_NAMES and all(is_mask(values) for values in parts):
+        if folded(name) not in _FOLDED and all(is_mask(values) for values in parts):
             mask = np.zeros(count, bool)
             for cells, values in zip(source.cells, parts, strict=True):
                 mask |= _nodes_of(cells, _nonzero(values), count)

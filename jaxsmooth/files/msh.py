@@ -18,7 +18,10 @@ import meshio
 import numpy as np
 from meshio.gmsh.common import _meshio_to_gmsh_order, _meshio_to_gmsh_type
 
+from jaxsmooth.files.regions import GROUPS, recall
+
 __all__ = [
+    "keep_groups",
     "read_msh_data",
     "repaired_msh",
     "sniff_msh",
@@ -82,6 +85,27 @@ def read_msh_data(content: bytes, mesh: meshio.Mesh) -> dict[str, list[np.ndarra
         full = full[:, 0] if width == 1 else full
         found[names[0]] = np.split(full, np.cumsum(sizes)[:-1])
     return found
+
+
+def keep_groups(mesh: meshio.Mesh, groups: dict[tuple[int, int], list[int]]) -> None:
+    """Give a 4.1 mesh what meshio drops: all groups of the entities that are in several.
+
+    ``gmsh:physical`` has room for one; the group with the fewest cells says most about them."""
+    several = {key: own for key, own in groups.items() if len(own) > 1}
+    if not several or "gmsh:physical" not in mesh.cell_data:
+        return
+    entities = [
+        (c.dim, int(t[0])) for c, t in zip(mesh.cells, mesh.cell_data["gmsh:geometrical"], strict=True)
+    ]
+    sizes: dict[tuple[int, int], int] = {}
+    for key, cells in zip(entities, mesh.cells, strict=True):
+        for group in groups.get(key, ()):
+            sizes[key[0], group] = sizes.get((key[0], group), 0) + len(cells)
+    for k, key in enumerate(entities):
+        if key in several:
+            least = min(several[key], key=lambda group, dim=key[0]: sizes[dim, group])
+            mesh.cell_data["gmsh:physical"][k] = np.full(len(mesh.cells[k]), least)
+    mesh.info = {GROUPS: several}
 
 
 def _with_physical_groups(content: bytes, binary: bool, size: int) -> bytes:
@@ -247,6 +271,8 @@ def _entities(mesh: meshio.Mesh, points: np.ndarray) -> dict[tuple[int, int], di
         low, high = entity.get("box", (own[0], own[0]))
         entity["box"] = (np.minimum(low, own.min(axis=0)), np.maximum(high, own.max(axis=0)))
         groups = [int(mesh.cell_data["gmsh:physical"][k][0])]
+        several = (recall(mesh, GROUPS) or {}).get(key, [])
+        groups = list(several) if groups[0] in several else groups
         for name, value in mesh.field_data.items():  # an entity may be in several groups
             members = mesh.cell_sets.get(name)
             if np.shape(value) == (2,) and value[1] == cells.dim and members is not None and k < len(members):
