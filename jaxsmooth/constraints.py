@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from jaxsmooth.elements import ElementType, element_type
 from jaxsmooth.mesh import Labels, Mesh
+from jaxsmooth.meshfile import as_mesh
 from jaxsmooth.topology import facet_keys, find_facets
 
 __all__ = ["Constraints", "coordinate_error", "detect_constraints"]
@@ -44,7 +45,7 @@ class Constraints(eqx.Module):
 
 
 def detect_constraints(
-    mesh: Mesh,
+    mesh: Any,
     *,
     boundary: str = "slide",
     interfaces: str = "slide",
@@ -59,7 +60,7 @@ def detect_constraints(
     that the mesh names, and of the borders between boundary cells of different tags.
 
     Args:
-        mesh: the mesh.
+        mesh: a `Mesh`, or whatever else `as_mesh` takes.
         boundary: ``"slide"``, or ``"fixed"`` to hold every boundary node.
         interfaces: the same choice for interfaces between regions.
         feature_angle: degrees.  A straight fold shallower than this belongs to a curved face,
@@ -77,6 +78,7 @@ def detect_constraints(
     for name, choice in (("boundary", boundary), ("interfaces", interfaces)):
         if choice not in ("slide", "fixed"):
             raise ValueError(f"{name} must be 'slide' or 'fixed', got {choice!r}")
+    mesh = as_mesh(mesh)
     points = np.asarray(mesh.points, np.float64)
     count, dim = points.shape
     noise = _SAFETY * coordinate_error(np.asarray(mesh.points))

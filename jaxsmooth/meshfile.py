@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import jax
 import meshio
 import numpy as np
 
@@ -164,6 +165,9 @@ def to_meshio(
 def as_mesh(anything: Any) -> Mesh:
     """A `Mesh` from whatever is one: `Mesh`, `MeshFile`, `meshio.Mesh`, ``(points, {"tetra": nodes})``.
 
+    A `Mesh` comes back as it is, its points traced by JAX or not; all else is read as files are, so
+    that reversed elements are turned, and nodes that belong together are held.
+
     Raises:
         ValueError: it is none of these, or not a mesh that can be smoothed.
     """
@@ -174,7 +178,7 @@ def as_mesh(anything: Any) -> Mesh:
     if isinstance(anything, meshio.Mesh):
         return from_meshio(anything).mesh
     if isinstance(anything, (tuple, list)) and len(anything) == 2:
-        return Mesh(*anything)
+        return from_meshio(_from_pair(*anything)).mesh
     raise ValueError(
         f"can't take {type(anything).__name__} for a mesh; give a Mesh, a MeshFile (read(path)), "
         "a meshio.Mesh or (points, {'tetra': connectivity})"
@@ -182,6 +186,26 @@ def as_mesh(anything: Any) -> Mesh:
 
 
 # --- From the source ---------------------------------------------------------------------
+
+
+def _from_pair(points: Any, blocks: Any) -> meshio.Mesh:
+    """What a pair ``(points, {"tetra": nodes})`` says, as a file would say it."""
+    if isinstance(points, jax.core.Tracer):
+        raise ValueError(
+            "the numbering of elements can't be checked while JAX traces the points; build the mesh before, "
+            "by as_mesh((points, blocks)), and trace mesh.with_points(points)"
+        )
+    pairs = blocks.items() if isinstance(blocks, Mapping) else blocks
+    cells = [(str(name), np.asarray(nodes)) for name, nodes in pairs]
+    for index, (name, nodes) in enumerate(cells):
+        if name not in SYNONYMS and name != "vertex":
+            element_type(name)  # raises for unknown names
+        if nodes.ndim != 2 or nodes.dtype.kind not in "iu":
+            raise ValueError(
+                f"block {index} ({name}): connectivity must be integers of shape [elements, k], "
+                f"got {nodes.dtype} {list(nodes.shape)}"
+            )
+    return meshio.Mesh(np.asarray(points), cells)
 
 
 def _cast(points: np.ndarray, dtype: Any) -> np.ndarray:
