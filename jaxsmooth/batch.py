@@ -52,7 +52,7 @@ def stack(meshes: Sequence[Any], constraints: Sequence[Constraints] | None = Non
     """Pad meshes of one dimension to a common shape and stack them.
 
     Args:
-        meshes: the meshes, each a `Mesh` or whatever else `as_mesh` takes; their blocks may differ in size and type.
+        meshes: each a `Mesh` or whatever else `as_mesh` takes; their blocks may differ in size and type.
         constraints: theirs; detected by default.
 
     Returns:

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from jaxsmooth.elements import ElementType, element_type
 from jaxsmooth.mesh import Labels, Mesh
 from jaxsmooth.meshfile import as_mesh
+from jaxsmooth.rounding import coordinate_error
 from jaxsmooth.topology import facet_keys, find_facets
 
 __all__ = ["Constraints", "coordinate_error", "detect_constraints"]
@@ -67,7 +68,7 @@ def detect_constraints(
             whose nodes are held; by default every straight fold is an edge to slide along.
         flatness: angle in radians below which facets lie in one plane.  By default it follows
             from the precision of the coordinates and the size of each facet (1e-4 at least).
-        fixed: nodes to hold besides: a mask ``[nodes]`` or indices.
+        fixed: nodes to hold besides those of `Labels.held`: a mask ``[nodes]`` or indices.
 
     Returns:
         The constraints.
@@ -97,6 +98,8 @@ def detect_constraints(
                     nodes, *_facet_normals(facets.type, points[nodes], noise[nodes].max(axis=1), flatness)
                 )
     if mesh.labels is not None:
+        if mesh.labels.held is not None:
+            held |= _mask(mesh.labels.held, count)
         _add_features(mesh.labels, points, noise, flatness, normals, tangents, held)
 
     projectors = np.tile(np.eye(dim), (count, 1, 1))
@@ -109,32 +112,6 @@ def detect_constraints(
     projectors[on_lines] = line * stays[:, None, None]
     projectors[held] = 0
     return Constraints(jnp.asarray(projectors, mesh.points.dtype))
-
-
-def coordinate_error(points: np.ndarray) -> np.ndarray:
-    """How far the coordinates of each node may be off ``[nodes]``.
-
-    By the rounding of their type, which is relative to their size; or, where text files carry
-    few significant digits, by that: the least number (of five to nine) that reproduces all
-    coordinates is taken for theirs.
-    """
-    sizes = np.abs(np.asarray(points))
-    values = sizes[sizes != 0]
-    if len(values) == 0:
-        return np.zeros(len(points))
-    with np.errstate(over="ignore"):
-        single = values.dtype == np.float32 or (values == values.astype(np.float32)).all()
-    machine = float(np.finfo(np.float32 if single else np.float64).eps)
-    error = machine * sizes.max(axis=1).astype(np.float64)
-    values = values.astype(np.float64)
-    unit = 10.0 ** np.floor(np.log10(values))
-    mantissa = values / unit
-    for decimals in range(4, 9):
-        if 0.5 * 10.0**-decimals < 16 * machine:
-            break  # the type itself carries no more
-        if (np.abs(mantissa - np.round(mantissa, decimals)) <= 8 * machine * mantissa).all():
-            return np.maximum(error, 0.5 * 10.0**-decimals * float(unit.max()))
-    return error
 
 
 def _mask(nodes: Any, count: int) -> np.ndarray:

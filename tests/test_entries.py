@@ -2,8 +2,8 @@
 
 import jax
 import jax.numpy as jnp
-import meshio
 import meshes
+import meshio
 import numpy as np
 import pytest
 
@@ -66,5 +66,5 @@ def test_wrong_pairs_are_refused_in_a_sentence():
         js.as_mesh((POINTS, {"triangle": SORTED.astype(float)}))
     with pytest.raises(ValueError, match="which is out of range"):
         js.as_mesh((POINTS, {"triangle": SORTED + 100}))
-    with pytest.raises(ValueError, match="trace mesh.with_points"):
+    with pytest.raises(ValueError, match=r"trace mesh\.with_points"):
         jax.jit(lambda points: js.quality_mean((points, {"triangle": SORTED})))(POINTS)

@@ -7,9 +7,10 @@ PACKAGE = Path(__file__).parents[1] / "jaxsmooth"
 ORDER = [
     ("quadrature",),
     ("elements",),
-    ("mesh", "small"),
+    ("mesh", "small", "rounding"),
     ("topology",),
-    ("orientation", "files.checks", "files.labels"),
+    ("orientation", "cohesive", "hanging", "files.checks", "files.labels"),
+    ("blocks", "coupling", "planes"),
     ("meshfile",),
     ("metrics", "constraints", "fitting", "elasticity"),
     ("patches", "solve", "distortion"),
