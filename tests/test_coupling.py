@@ -146,7 +146,7 @@ def refined(parts, turn=False):
     """Two unit cubes side by side, the second cut into `parts` a side: points, hexahedra, hanging nodes."""
     grid, cells = meshes.grid("hexahedron", (parts,) * 3)
     corners, one = meshes.grid("hexahedron", (1, 1, 1))
-    grid = grid + [1, 0, 0]
+    grid = grid + np.array([1, 0, 0])
     points = np.concatenate([corners, grid])
     number = np.arange(len(points))
     for node, place in enumerate(corners):
