@@ -18,6 +18,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from jaxsmooth.elements import ElementType, element_type
+from jaxsmooth.layers import boundary_layers, nodes_of, stretched
 from jaxsmooth.mesh import Labels, Mesh
 from jaxsmooth.meshfile import as_mesh
 from jaxsmooth.rounding import coordinate_error, type_error
@@ -57,6 +58,8 @@ def detect_constraints(
     feature_angle: float = 0.0,
     flatness: float | None = None,
     fixed: Any = None,
+    layers: str = "hold",
+    freeze_aspect: float | None = None,
 ) -> Constraints:
     """Find how every node may move so that the shape of the domain is kept.
 
@@ -73,16 +76,23 @@ def detect_constraints(
         flatness: angle in radians below which facets lie in one plane.  By default it follows
             from the precision of the coordinates and the size of each facet (1e-4 at least).
         fixed: nodes to hold besides those of `Labels.held`: a mask ``[nodes]`` or indices.
+        layers: ``"hold"`` to hold the nodes of boundary layers (`boundary_layers`), whose elements
+            are stretched on purpose, or ``"free"``.
+        freeze_aspect: hold the nodes of all elements of a greater aspect ratio (`aspect_ratios`).
 
     Returns:
         The constraints.
 
     Raises:
-        ValueError: for an unknown choice, or a mask of another length.
+        ValueError: for an unknown choice, a mask of another length, or an aspect ratio below 1.
     """
     for name, choice in (("boundary", boundary), ("interfaces", interfaces)):
         if choice not in ("slide", "fixed"):
             raise ValueError(f"{name} must be 'slide' or 'fixed', got {choice!r}")
+    if layers not in ("hold", "free"):
+        raise ValueError(f"layers must be 'hold' or 'free', got {layers!r}")
+    if freeze_aspect is not None and not freeze_aspect >= 1:
+        raise ValueError(f"freeze_aspect must be 1 or more, got {freeze_aspect}")
     mesh = as_mesh(mesh)
     points = np.asarray(mesh.points, np.float64)
     count, dim = points.shape
@@ -91,7 +101,12 @@ def detect_constraints(
     size = float(np.ptp(points, axis=0).max())
     normals, tangents = _Directions(count, dim, size), _Directions(count, dim, size)
 
-    for facets in find_facets(mesh):
+    all_facets = find_facets(mesh)
+    if layers == "hold":
+        held |= nodes_of(mesh, boundary_layers(mesh, all_facets))
+    if freeze_aspect is not None:
+        held |= nodes_of(mesh, stretched(mesh, freeze_aspect))
+    for facets in all_facets:
         outer = facets.partner < 0
         between = ~outer & (facets.partner != facets.region)
         for chosen, choice in ((outer, boundary), (between, interfaces)):

@@ -28,6 +28,7 @@ from jaxsmooth.files.checks import (
     element_dim,
 )
 from jaxsmooth.files.labels import held_nodes, make_labels, make_named_sets, plain
+from jaxsmooth.layers import STRETCHED, boundary_layers, stretched
 from jaxsmooth.mesh import Mesh
 from jaxsmooth.planes import Plane, find_plane
 
@@ -120,7 +121,7 @@ def from_meshio(
         getattr(source, "gmsh_periodic", None),
         held,
     )
-    notes += sentences
+    notes += sentences + _stretch(mesh)
     held |= fixed | together
     mesh = mesh.with_labels(replace(labels, held=held if held.any() else None))
     if dtype is not None and mesh.points.dtype != np.dtype(dtype):
@@ -223,6 +224,19 @@ def _from_pair(points: Any, blocks: Any) -> meshio.Mesh:
                 f"got {nodes.dtype} {list(nodes.shape)}"
             )
     return meshio.Mesh(np.asarray(points), cells)
+
+
+def _stretch(mesh: Mesh) -> list[str]:
+    """A note on elements that are stretched, if there are some."""
+    number = sum(int(mask.sum()) for mask in stretched(mesh))
+    if not number:
+        return []
+    layer = sum(int(mask.sum()) for mask in boundary_layers(mesh))
+    held = f", {layer} of them in boundary layers, whose nodes are held" if layer else ""
+    return [
+        f"{number} elements are stretched beyond {STRETCHED:g}{held}; --freeze-aspect A (freeze_aspect=A) "
+        "holds all those beyond A"
+    ]
 
 
 def _cast(points: np.ndarray, dtype: Any) -> np.ndarray:

@@ -9,7 +9,7 @@ ORDER = [
     ("elements",),
     ("mesh", "small", "rounding"),
     ("topology",),
-    ("orientation", "cohesive", "hanging", "files.checks", "files.labels"),
+    ("orientation", "cohesive", "hanging", "layers", "files.checks", "files.labels"),
     ("blocks", "coupling", "planes"),
     ("meshfile",),
     ("metrics", "constraints", "fitting", "elasticity"),
