@@ -18,7 +18,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from jaxsmooth.elements import ElementType, element_type
-from jaxsmooth.layers import boundary_layers, nodes_of, stretched
+from jaxsmooth.layers import layer_nodes, nodes_of, stretched
 from jaxsmooth.mesh import Labels, Mesh
 from jaxsmooth.meshfile import as_mesh
 from jaxsmooth.rounding import coordinate_error, type_error
@@ -76,8 +76,8 @@ def detect_constraints(
         flatness: angle in radians below which facets lie in one plane.  By default it follows
             from the precision of the coordinates and the size of each facet (1e-4 at least).
         fixed: nodes to hold besides those of `Labels.held`: a mask ``[nodes]`` or indices.
-        layers: ``"hold"`` to hold the nodes of boundary layers (`boundary_layers`), whose elements
-            are stretched on purpose, or ``"free"``.
+        layers: ``"hold"`` to hold the nodes of boundary layers (`layer_nodes`), whose elements are
+            stretched on purpose, or ``"free"``.
         freeze_aspect: hold the nodes of all elements of a greater aspect ratio (`aspect_ratios`).
 
     Returns:
@@ -103,7 +103,7 @@ def detect_constraints(
 
     all_facets = find_facets(mesh)
     if layers == "hold":
-        held |= nodes_of(mesh, boundary_layers(mesh, all_facets))
+        held |= layer_nodes(mesh, all_facets)
     if freeze_aspect is not None:
         held |= nodes_of(mesh, stretched(mesh, freeze_aspect))
     for facets in all_facets:

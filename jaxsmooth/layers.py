@@ -12,7 +12,7 @@ from jaxsmooth.elements import ElementType
 from jaxsmooth.mesh import Mesh
 from jaxsmooth.topology import Facets, facet_keys, find_facets
 
-__all__ = ["STRETCHED", "aspect_ratios", "boundary_layers", "nodes_of", "stretched"]
+__all__ = ["STRETCHED", "aspect_ratios", "boundary_layers", "layer_nodes", "nodes_of", "stretched"]
 
 STRETCHED = 10.0  # aspect ratio from which an element counts as stretched
 _SQUARE = 0.5  # least scaled Jacobian of an element of a layer: it stands upright
@@ -132,6 +132,23 @@ def boundary_layers(mesh: Mesh, facets: Sequence[Facets] | None = None) -> tuple
         np.isin(np.arange(len(nodes)), row[chosen & (block == index)])
         for index, (_, nodes) in enumerate(blocks)
     )
+
+
+def layer_nodes(mesh: Mesh, facets: Sequence[Facets] | None = None) -> np.ndarray:
+    """The nodes ``[nodes]`` that hold the boundary layers: all of theirs but those to be repaired.
+
+    Nodes of inverted elements and of the elements around these are free to move, of a layer or not.
+
+    Args:
+        mesh: a `Mesh`.
+        facets: its facets, where they are known.
+    """
+    held = nodes_of(mesh, boundary_layers(mesh, facets))
+    if held.any():
+        blocks = [(kind, np.asarray(nodes)) for kind, nodes in mesh.blocks]
+        broken = _broken(blocks, np.asarray(mesh.points, np.float64), len(mesh.points))
+        held &= ~nodes_of(mesh, [broken[nodes].any(axis=1) for _, nodes in blocks])
+    return held
 
 
 def nodes_of(mesh: Mesh, masks: Sequence[np.ndarray]) -> np.ndarray:
