@@ -20,6 +20,7 @@ _HOMES = {
     "elasticity": ("Material",),
     "elements": ("element_type",),
     "io": ("read", "write"),
+    "layers": ("boundary_layers", "stretched"),
     "mesh": ("Labels", "Mesh"),
     "meshfile": ("MeshFile", "as_mesh", "from_meshio"),
     "methods": ("METHODS", "Elastic", "Laplacian", "Method", "Optimize"),
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from jaxsmooth.elasticity import Material
     from jaxsmooth.elements import element_type
     from jaxsmooth.io import read, write
+    from jaxsmooth.layers import boundary_layers, stretched
     from jaxsmooth.mesh import Labels, Mesh
     from jaxsmooth.meshfile import MeshFile, as_mesh, from_meshio
     from jaxsmooth.methods import METHODS, Elastic, Laplacian, Method, Optimize

@@ -18,7 +18,7 @@ STRETCHED = 10.0  # aspect ratio from which an element counts as stretched
 _SQUARE = 0.5  # least scaled Jacobian of an element of a layer: it stands upright
 # Layers grow by a tenth to a third from one element to the next, in a dozen steps or two; what is merely
 # squeezed against a boundary has neighbours of its own thickness (Shashkov's grid: 2 % a step).
-_LEAST, _GROWTH = 3, 1.05
+_LEAST, _GROWTH = 3, 1.08
 
 
 def aspect_ratios(kind: ElementType, points: np.ndarray, nodes: np.ndarray) -> np.ndarray:
@@ -98,7 +98,7 @@ def boundary_layers(mesh: Mesh, facets: Sequence[Facets] | None = None) -> tuple
 
     Quadrilaterals, wedges and hexahedra of an aspect ratio beyond 10 and a scaled Jacobian beyond
     0.5 are of a layer when they lie one upon the other with their large facets, three at least, from
-    a boundary facet on, and become thicker by 5 % from one to the next, on average.  Inverted
+    a boundary facet on, and become thicker by 8 % from one to the next, on average.  Inverted
     elements, and those that have a node of one, are to be repaired: they are passed through, but
     they are not of the layer.
 

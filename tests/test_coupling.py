@@ -123,6 +123,30 @@ def test_boundaries_that_come_close_are_left_alone():
 # --- Periodic pairs ----------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("file_format", ["gmsh", "gmsh22"])
+def test_periodic_links_of_gmsh(tmp_path, file_format):
+    """A square whose left and right sides Gmsh itself linked."""
+    gmsh = pytest.importorskip("gmsh")
+    gmsh.initialize(interruptible=False)
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.option.setNumber("Mesh.MeshSizeMax", 0.3)
+        gmsh.option.setNumber("Mesh.MshFileVersion", {"gmsh": 4.1, "gmsh22": 2.2}[file_format])
+        gmsh.model.occ.addRectangle(0, 0, 0, 1, 1)
+        gmsh.model.occ.synchronize()
+        gmsh.model.mesh.setPeriodic(1, [2], [4], [1, 0, 0, 1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1])
+        gmsh.model.mesh.generate(2)
+        gmsh.write(str(tmp_path / "square.msh"))
+    finally:
+        gmsh.finalize()
+    file = js.read(tmp_path / "square.msh")
+    x, y = np.asarray(file.mesh.points).T
+    sides = (x == 0) | (np.abs(x - 1) < 1e-12)
+    assert sides.sum() >= 10
+    np.testing.assert_array_equal(held(file), sides)
+    assert (js.detect_constraints(file.mesh).freedom[~sides & (y > 1e-9) & (y < 1 - 1e-9)] == 2).all()
+
+
 def test_periodic_nodes_are_held():
     points, blocks = meshes.grid("triangle", (3, 3))
     left, right = (np.flatnonzero(points[:, 0] == x) for x in (0, 1))

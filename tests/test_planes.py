@@ -105,3 +105,13 @@ def test_cases(name):
     normal = 3 - sum(file.plane.columns)
     out = to_meshio(file, result.mesh.points).points
     np.testing.assert_array_equal(out[:, normal], file.source.points[:, normal])
+
+
+def test_a_format_without_z_refuses_other_planes(tmp_path):
+    standing = js.from_meshio(meshio.Mesh(in_space()[:, [0, 2, 1]], BLOCKS))
+    with pytest.raises(MeshFileError, match="lies in another plane"):
+        js.write(tmp_path / "a.su2", standing)
+    assert list(tmp_path.iterdir()) == []
+    lying = js.from_meshio(meshio.Mesh(in_space(normal=4e-6 * np.cos(np.arange(len(FLAT)))), BLOCKS))
+    js.write(tmp_path / "a.su2", lying)
+    np.testing.assert_allclose(js.read(tmp_path / "a.su2").mesh.points, FLAT, atol=1e-12)

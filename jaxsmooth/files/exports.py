@@ -113,6 +113,7 @@ def _clean(mesh: meshio.Mesh, stem: str, dim: int, notes: list[str]) -> meshio.M
     ]
     out.points = plain(mesh.points)
     if stem == "su2" and dim == 2:  # its dimension is the number of coordinates
+        _check_upright(out)
         out.points = out.points[:, :2]
     elif stem in (*_VTK, "xdmf", "gmsh22", "abaqus") and out.points.shape[1] == 2:
         out.points = np.pad(out.points, ((0, 0), (0, 1)))
@@ -205,6 +206,17 @@ def _free(name: str, taken) -> str:
     while name in taken:
         name += "_set"
     return name
+
+
+def _check_upright(mesh: meshio.Mesh) -> None:
+    """Raise `MeshFileError` where x and y alone would not say where plane elements are."""
+    nodes = np.unique(np.concatenate([cells.data.ravel() for cells in mesh.cells if cells.dim == 2]))
+    extent = np.ptp(mesh.points[nodes], axis=0)
+    if len(extent) == 3 and extent[2] > 1e-5 * extent[:2].max():
+        raise MeshFileError(
+            "su2 files hold x and y of plane meshes and nothing else, but this one lies in another plane; "
+            "choose another format"
+        )
 
 
 def _reduce_data(mesh: meshio.Mesh, stem: str, dim: int, notes: list[str]) -> None:
