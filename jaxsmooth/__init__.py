@@ -21,8 +21,9 @@ _HOMES = {
     "elasticity": ("Material",),
     "elements": ("element_type",),
     "io": ("read", "write"),
+    "layers": ("boundary_layers", "stretched"),
     "mesh": ("Labels", "Mesh"),
-    "meshfile": ("MeshFile", "from_meshio"),
+    "meshfile": ("MeshFile", "as_mesh", "from_meshio"),
     "methods": ("METHODS", "Elastic", "Laplacian", "Method", "Optimize"),
     "patches": ("PatchGuard",),
     "metrics": ("METRICS", "quality", "quality_mean"),
@@ -39,8 +40,9 @@ if TYPE_CHECKING:
     from jaxsmooth.elasticity import Material
     from jaxsmooth.elements import element_type
     from jaxsmooth.io import read, write
+    from jaxsmooth.layers import boundary_layers, stretched
     from jaxsmooth.mesh import Labels, Mesh
-    from jaxsmooth.meshfile import MeshFile, from_meshio
+    from jaxsmooth.meshfile import MeshFile, as_mesh, from_meshio
     from jaxsmooth.methods import METHODS, Elastic, Laplacian, Method, Optimize
     from jaxsmooth.metrics import METRICS, quality, quality_mean
     from jaxsmooth.patches import PatchGuard

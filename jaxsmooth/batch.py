@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsmooth.constraints import Constraints, detect_constraints
 from jaxsmooth.elements import element_type
 from jaxsmooth.mesh import Mesh
+from jaxsmooth.meshfile import as_mesh
 
 __all__ = ["Batch", "stack"]
 
@@ -46,11 +48,11 @@ class Batch(eqx.Module):
         return total / sum(m.sum(axis=1) for m in self.elements)
 
 
-def stack(meshes: Sequence[Mesh], constraints: Sequence[Constraints] | None = None) -> Batch:
+def stack(meshes: Sequence[Any], constraints: Sequence[Constraints] | None = None) -> Batch:
     """Pad meshes of one dimension to a common shape and stack them.
 
     Args:
-        meshes: the meshes; their blocks may differ in size and type.
+        meshes: each a `Mesh` or whatever else `as_mesh` takes; their blocks may differ in size and type.
         constraints: theirs; detected by default.
 
     Returns:
@@ -59,6 +61,7 @@ def stack(meshes: Sequence[Mesh], constraints: Sequence[Constraints] | None = No
     Raises:
         ValueError: for no meshes, or meshes of different dimensions.
     """
+    meshes = [as_mesh(mesh) for mesh in meshes]
     if not meshes or len({mesh.dim for mesh in meshes}) > 1:
         raise ValueError("stack needs meshes of one dimension, at least one")
     constraints = [detect_constraints(m) for m in meshes] if constraints is None else constraints

@@ -8,21 +8,28 @@ depend on numbering.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from jaxsmooth.elements import ElementType, element_type
+from jaxsmooth.layers import layer_nodes, nodes_of, stretched
 from jaxsmooth.mesh import Labels, Mesh
+from jaxsmooth.meshfile import as_mesh
+from jaxsmooth.rounding import coordinate_error, type_error
 from jaxsmooth.topology import facet_keys, find_facets
 
 __all__ = ["Constraints", "coordinate_error", "detect_constraints"]
 
 _FLAT, _ROUGH = 1e-4, 2e-2  # radians: bounds of the flatness tolerance
 _SAFETY = 4.0  # noise of a direction, in units of coordinate error over length
+_USUAL = 1e-6  # of the size of a mesh: the noise that weighs small facets against large ones
+_SNAP = 1e-12  # components of a direction below this are rounding: it lies along axes or planes of them
 
 
 class Constraints(eqx.Module):
@@ -44,13 +51,15 @@ class Constraints(eqx.Module):
 
 
 def detect_constraints(
-    mesh: Mesh,
+    mesh: Any,
     *,
     boundary: str = "slide",
     interfaces: str = "slide",
     feature_angle: float = 0.0,
     flatness: float | None = None,
     fixed: Any = None,
+    layers: str = "hold",
+    freeze_aspect: float | None = None,
 ) -> Constraints:
     """Find how every node may move so that the shape of the domain is kept.
 
@@ -59,31 +68,45 @@ def detect_constraints(
     that the mesh names, and of the borders between boundary cells of different tags.
 
     Args:
-        mesh: the mesh.
+        mesh: a `Mesh`, or whatever else `as_mesh` takes.
         boundary: ``"slide"``, or ``"fixed"`` to hold every boundary node.
         interfaces: the same choice for interfaces between regions.
         feature_angle: degrees.  A straight fold shallower than this belongs to a curved face,
             whose nodes are held; by default every straight fold is an edge to slide along.
         flatness: angle in radians below which facets lie in one plane.  By default it follows
             from the precision of the coordinates and the size of each facet (1e-4 at least).
-        fixed: nodes to hold besides: a mask ``[nodes]`` or indices.
+        fixed: nodes to hold besides those of `Labels.held`: a mask ``[nodes]`` or indices.
+        layers: ``"hold"`` to hold the nodes of boundary layers (`layer_nodes`), whose elements are
+            stretched on purpose, or ``"free"``.
+        freeze_aspect: hold the nodes of all elements of a greater aspect ratio (`aspect_ratios`).
 
     Returns:
         The constraints.
 
     Raises:
-        ValueError: for an unknown choice, or a mask of another length.
+        ValueError: for an unknown choice, a mask of another length, or an aspect ratio below 1.
     """
     for name, choice in (("boundary", boundary), ("interfaces", interfaces)):
         if choice not in ("slide", "fixed"):
             raise ValueError(f"{name} must be 'slide' or 'fixed', got {choice!r}")
+    if layers not in ("hold", "free"):
+        raise ValueError(f"layers must be 'hold' or 'free', got {layers!r}")
+    if freeze_aspect is not None and not freeze_aspect >= 1:
+        raise ValueError(f"freeze_aspect must be 1 or more, got {freeze_aspect}")
+    mesh = as_mesh(mesh)
     points = np.asarray(mesh.points, np.float64)
     count, dim = points.shape
-    noise = _SAFETY * coordinate_error(np.asarray(mesh.points))
+    noise = _Noise.of(np.asarray(mesh.points))
     held = _mask(fixed, count)
-    normals, tangents = _Directions(count, dim), _Directions(count, dim)
+    size = float(np.ptp(points, axis=0).max())
+    normals, tangents = _Directions(count, dim, size), _Directions(count, dim, size)
 
-    for facets in find_facets(mesh):
+    all_facets = find_facets(mesh)
+    if layers == "hold":
+        held |= layer_nodes(mesh, all_facets)
+    if freeze_aspect is not None:
+        held |= nodes_of(mesh, stretched(mesh, freeze_aspect))
+    for facets in all_facets:
         outer = facets.partner < 0
         between = ~outer & (facets.partner != facets.region)
         for chosen, choice in ((outer, boundary), (between, interfaces)):
@@ -91,10 +114,10 @@ def detect_constraints(
             if choice == "fixed":
                 held[nodes] = True
             else:
-                normals.add(
-                    nodes, *_facet_normals(facets.type, points[nodes], noise[nodes].max(axis=1), flatness)
-                )
+                normals.add(nodes, _facet_normals(facets.type, points[nodes], noise.at(nodes), flatness))
     if mesh.labels is not None:
+        if mesh.labels.held is not None:
+            held |= _mask(mesh.labels.held, count)
         _add_features(mesh.labels, points, noise, flatness, normals, tangents, held)
 
     projectors = np.tile(np.eye(dim), (count, 1, 1))
@@ -109,30 +132,19 @@ def detect_constraints(
     return Constraints(jnp.asarray(projectors, mesh.points.dtype))
 
 
-def coordinate_error(points: np.ndarray) -> np.ndarray:
-    """How far the coordinates of each node may be off ``[nodes]``.
+class _Noise(NamedTuple):
+    """How far places may be off: by all there is, and by the rounding of their type alone."""
 
-    By the rounding of their type, which is relative to their size; or, where text files carry
-    few significant digits, by that: the least number (of five to nine) that reproduces all
-    coordinates is taken for theirs.
-    """
-    sizes = np.abs(np.asarray(points))
-    values = sizes[sizes != 0]
-    if len(values) == 0:
-        return np.zeros(len(points))
-    with np.errstate(over="ignore"):
-        single = values.dtype == np.float32 or (values == values.astype(np.float32)).all()
-    machine = float(np.finfo(np.float32 if single else np.float64).eps)
-    error = machine * sizes.max(axis=1).astype(np.float64)
-    values = values.astype(np.float64)
-    unit = 10.0 ** np.floor(np.log10(values))
-    mantissa = values / unit
-    for decimals in range(4, 9):
-        if 0.5 * 10.0**-decimals < 16 * machine:
-            break  # the type itself carries no more
-        if (np.abs(mantissa - np.round(mantissa, decimals)) <= 8 * machine * mantissa).all():
-            return np.maximum(error, 0.5 * 10.0**-decimals * float(unit.max()))
-    return error
+    all: np.ndarray
+    type: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray) -> _Noise:
+        return cls(_SAFETY * coordinate_error(points), _SAFETY * type_error(points))
+
+    def at(self, nodes: np.ndarray) -> _Noise:
+        """The largest of the nodes of each facet ``[m, k]``."""
+        return _Noise(self.all[nodes].max(axis=1), self.type[nodes].max(axis=1))
 
 
 def _mask(nodes: Any, count: int) -> np.ndarray:
@@ -152,57 +164,105 @@ class _Directions:
     """Unit vectors gathered at nodes, each with the angle to which it is known.
 
     A direction v is *normal* to all vectors at a node when the mean square of their cosines
-    with v, each over its own tolerance, is at most 1.
+    with v, each over its own tolerance, is at most 1.  Tolerances decide this rank and nothing
+    else: which direction it is follows from the vectors, by weights that no rounding enters.
     """
 
-    def __init__(self, count: int, dim: int):
-        self.square = np.zeros((count, dim, dim))
-        self.number = np.zeros(count)
-        self.parts: list[tuple[np.ndarray, np.ndarray]] = []
+    def __init__(self, count: int, dim: int, size: float):
+        self.count, self.dim, self.size = count, dim, size
+        self.parts: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
+        self.joined: list[np.ndarray] = []
 
-    def add(self, nodes: np.ndarray, vectors: np.ndarray, tolerance: np.ndarray) -> None:
-        """Add vectors ``[m, s, dim]`` with tolerances ``[m]`` at all nodes ``[m, k]``."""
-        count, dim = self.square.shape[:2]
-        outer = np.einsum("msi,msj,m->mij", vectors, vectors, 1 / tolerance**2)
-        flat = nodes.reshape(-1)
-        for i in range(dim):
-            for j in range(dim):
-                weight = np.repeat(outer[:, i, j], nodes.shape[1])
-                self.square[:, i, j] += np.bincount(flat, weight, minlength=count)
-        self.number += vectors.shape[1] * np.bincount(flat, minlength=count)
-        self.parts.append((nodes, vectors))
+    def add(self, nodes: np.ndarray, found: _Vectors) -> None:
+        """Add vectors to all nodes ``[m, k]`` of the facets or segments that have them."""
+        known = found.known
+        weight = 1 / np.clip(_USUAL * self.size / found.height[known], _FLAT, _ROUGH) ** 2
+        self.parts.append((nodes[known], found.vectors[known], 1 / found.tolerance[known] ** 2, weight))
+        if not known.all():
+            self.joined.append(nodes[~known])
 
-    def _spectrum(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        touched = np.flatnonzero(self.number)
-        values, vectors = np.linalg.eigh(self.square[touched])
-        return touched, values <= self.number[touched, None], vectors
+    def _groups(self) -> tuple[np.ndarray, np.ndarray]:
+        """For each node the one it shares its vectors with, and the nodes of facets without a direction."""
+        group, lost = np.arange(self.count), np.zeros(self.count, bool)
+        if self.joined:
+            ends = np.concatenate(
+                [np.stack(np.broadcast_arrays(part[:, :1], part), -1).reshape(-1, 2) for part in self.joined]
+            )
+            lost[ends] = True
+            graph = coo_matrix((np.ones(len(ends), np.int8), ends.T), shape=(self.count, self.count))
+            _, group = connected_components(graph, directed=False)
+        return group, lost
+
+    def _sum(self, group: np.ndarray, chosen: np.ndarray, weighted: bool) -> np.ndarray:
+        """Sums of the squares of the vectors ``[nodes, dim, dim]`` in groups that are chosen."""
+        square = np.zeros((self.count, self.dim, self.dim))
+        for nodes, vectors, precision, weight in self.parts:
+            rows = slice(None) if chosen.all() else chosen[group[nodes]].any(axis=1)
+            factor = (precision if weighted else weight)[rows]
+            outer = np.einsum("msi,msj,m->mij", vectors[rows], vectors[rows], factor)
+            flat = group[nodes[rows]].reshape(-1)
+            for i in range(self.dim):
+                for j in range(i + 1):
+                    part = np.repeat(outer[:, i, j], nodes.shape[1])
+                    square[:, i, j] += np.bincount(flat, part, minlength=self.count)
+        lower = np.tril(square, -1)
+        return square + lower.swapaxes(1, 2)
+
+    def _ranks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Nodes that have vectors, how many directions these span, and their groups."""
+        group, lost = self._groups()
+        number = np.zeros(self.count)
+        for nodes, vectors, *_ in self.parts:
+            number += vectors.shape[1] * np.bincount(group[nodes].reshape(-1), minlength=self.count)
+        every = np.ones(self.count, bool)
+        touched = np.flatnonzero((number[group] > 0) | lost)
+        own = group[touched]
+        values = np.linalg.eigvalsh(self._sum(group, every, True)[own])
+        rank = (values > number[own, None]).sum(axis=1)
+        return touched, np.where(number[own] > 0, rank, self.dim), group
+
+    def _vectors(self, nodes: np.ndarray, group: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """Eigenvectors of the vectors' squares at nodes, counted from that of the least value."""
+        chosen = np.zeros(self.count, bool)
+        chosen[group[nodes]] = True
+        vectors = np.linalg.eigh(self._sum(group, chosen, False)[group[nodes]])[1]
+        vector = np.take_along_axis(vectors, which[:, None, None], axis=2)[..., 0]
+        vector[np.abs(vector) < _SNAP] = 0
+        return vector
 
     def null_space(self) -> tuple[np.ndarray, np.ndarray]:
         """Nodes that have vectors, and the projectors onto what is normal to all of them."""
-        touched, normal, vectors = self._spectrum()
-        return touched, np.einsum("nij,nj,nkj->nik", vectors, normal, vectors)
+        touched, rank, group = self._ranks()
+        free = np.zeros((len(touched), self.dim, self.dim))
+        free[rank == 0] = np.eye(self.dim)
+        open_ = np.flatnonzero((rank > 0) & (rank < self.dim))
+        plane = rank[open_] == 1  # one normal; else one free direction
+        found = _onto(self._vectors(touched[open_], group, np.where(plane, self.dim - 1, 0)))
+        free[open_] = np.where(plane[:, None, None], np.eye(self.dim) - found, found)
+        return touched, free
 
     def common_line(self) -> tuple[np.ndarray, np.ndarray]:
         """Nodes that have vectors, and the projector onto their line, or 0 where they disagree."""
-        touched, normal, vectors = self._spectrum()
-        aligned = normal[:, :-1].all(axis=1)
-        top = vectors[..., -1]
-        return touched, np.einsum("ni,nj,n->nij", top, top, aligned)
+        touched, rank, group = self._ranks()
+        line = np.zeros((len(touched), self.dim, self.dim))
+        one = np.flatnonzero(rank == 1)
+        line[one] = _onto(self._vectors(touched[one], group, np.full(len(one), self.dim - 1)))
+        return touched, line
 
     def fold_angles(self, touched: np.ndarray, free: np.ndarray) -> np.ndarray:
         """Angle of the fold at nodes that are free along one line in 3D; infinite elsewhere."""
-        count, dim = self.square.shape[:2]
-        if dim == 2:
+        count = self.count
+        if self.dim == 2:
             return np.full(len(touched), np.inf)
         line = np.zeros((count, 3))
         line[touched] = np.linalg.eigh(free)[1][..., -1]
         folded = np.zeros(count, dtype=bool)
         folded[touched] = np.rint(np.trace(free, axis1=1, axis2=2)) == 1
         low, high, mean = np.full(count, np.inf), np.full(count, -np.inf), np.zeros((count, 3))
-        for nodes, vectors in self.parts:
+        for nodes, vectors, *_ in self.parts:
             np.add.at(mean, nodes, vectors.mean(axis=1)[:, None])
         side = np.cross(line, mean)
-        for nodes, vectors in self.parts:
+        for nodes, vectors, *_ in self.parts:
             along = np.einsum("msd,mkd->mks", vectors, mean[nodes])
             across = np.einsum("msd,mkd->mks", vectors, side[nodes])
             angle = np.arctan2(across, along)
@@ -211,35 +271,54 @@ class _Directions:
         return np.where(folded, high - low, np.inf)[touched]
 
 
-def _tolerance(noise: np.ndarray, length: np.ndarray, flatness: float | None) -> np.ndarray:
+def _onto(vectors: np.ndarray) -> np.ndarray:
+    """Projectors onto vectors ``[m, dim]``."""
+    square = np.einsum("mi,mj->mij", vectors, vectors)
+    return square / np.einsum("mi,mi->m", vectors, vectors)[:, None, None]
+
+
+class _Vectors(NamedTuple):
+    """Unit vectors ``[m, s, dim]`` of facets or segments.
+
+    `height` is their least extent, `tolerance` the angle to which they are known; where the height
+    is but a rounding there is no direction, and `known` is false."""
+
+    vectors: np.ndarray
+    height: np.ndarray
+    tolerance: np.ndarray
+    known: np.ndarray
+
+
+def _known(vectors: np.ndarray, size: np.ndarray, height, noise: _Noise, flatness: float | None) -> _Vectors:
+    """Vectors ``[m, s, dim]`` of their sizes ``[m, s]`` made unit ones."""
+    known = (height > noise.type) & (size > 0).all(axis=1)
+    tolerance = np.clip(noise.all / np.maximum(height, np.finfo(float).tiny), _FLAT, _ROUGH)
     if flatness is not None:
-        return np.full(len(length), float(flatness))
-    return np.clip(noise / np.maximum(length, np.finfo(float).tiny), _FLAT, _ROUGH)
+        tolerance = np.full(len(height), float(flatness))
+    return _Vectors(vectors / np.where(size > 0, size, 1)[..., None], height, tolerance, known)
 
 
-def _facet_normals(
-    kind: ElementType, nodes: np.ndarray, noise: np.ndarray, flatness: float | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals ``[m, q, dim]`` at the quadrature points, and how well they are known."""
+def _facet_normals(kind: ElementType, nodes: np.ndarray, noise: _Noise, flatness: float | None) -> _Vectors:
+    """Unit normals at the quadrature points of facets ``[m, k, dim]``."""
     tangents = np.einsum("mkd,qke->mqde", nodes, kind.slopes)
     if kind.dim == 1:
         normals = np.stack([tangents[..., 1, 0], -tangents[..., 0, 0]], axis=-1)
     else:
         normals = np.cross(tangents[..., 0], tangents[..., 1])
-    size = np.linalg.norm(normals, axis=-1, keepdims=True)
-    area = (size[..., 0] @ kind.slope_weights) if kind.dim == 2 else None
+    size = np.linalg.norm(normals, axis=-1)
+    area = (size @ kind.slope_weights) if kind.dim == 2 else None
     corners = nodes[:, : kind.corners]
     longest = np.linalg.norm(corners[:, kind.edges[:, 0]] - corners[:, kind.edges[:, 1]], axis=-1).max(axis=1)
     height = longest if area is None else area / np.maximum(longest, np.finfo(float).tiny)
     if kind.order == 2:  # tangents at the ends magnify what a mid-side node is off by
         height = height / 4
-    return normals / np.where(size > 0, size, 1), _tolerance(noise, height, flatness)
+    return _known(normals, size, height, noise, flatness)
 
 
 def _add_features(
     labels: Labels,
     points: np.ndarray,
-    noise: np.ndarray,
+    noise: _Noise,
     flatness: float | None,
     normals: _Directions,
     tangents: _Directions,
@@ -254,19 +333,19 @@ def _add_features(
             continue
         kind = element_type(name)
         if kind.dim == 2 and dim == 3:
-            normals.add(nodes, *_facet_normals(kind, points[nodes], noise[nodes].max(axis=1), flatness))
+            normals.add(nodes, _facet_normals(kind, points[nodes], noise.at(nodes), flatness))
             sides = nodes[:, kind.segments]
             edges.append(sides.reshape(-1, 2))
             edge_tags.append(np.repeat(tags, sides.shape[1]))
         elif kind.dim == 1:
             segments = nodes[:, kind.segments].reshape(-1, 2)
-            tangents.add(segments, *_unit_tangents(points[segments], noise[segments].max(axis=1), flatness))
+            tangents.add(segments, _unit_tangents(points[segments], noise.at(segments), flatness))
             ends.append(nodes[:, :2].reshape(-1))
             end_tags.append(np.repeat(tags, 2))
     if edges:
         pairs, tags = np.concatenate(edges), np.concatenate(edge_tags)
         border = pairs[_on_border(facet_keys(pairs, count), tags)]
-        tangents.add(border, *_unit_tangents(points[border], noise[border].max(axis=1), flatness))
+        tangents.add(border, _unit_tangents(points[border], noise.at(border), flatness))
     if ends:
         nodes, tags = np.concatenate(ends), np.concatenate(end_tags)
         held[nodes[_on_border(nodes, tags)]] = True
@@ -281,9 +360,7 @@ def _on_border(keys: np.ndarray, tags: np.ndarray) -> np.ndarray:
     return (mixed | (number == 1))[group]
 
 
-def _unit_tangents(
-    ends: np.ndarray, noise: np.ndarray, flatness: float | None
-) -> tuple[np.ndarray, np.ndarray]:
+def _unit_tangents(ends: np.ndarray, noise: _Noise, flatness: float | None) -> _Vectors:
     vectors = ends[:, 1] - ends[:, 0]
     length = np.linalg.norm(vectors, axis=1)
-    return (vectors / np.where(length > 0, length, 1)[:, None])[:, None], _tolerance(noise, length, flatness)
+    return _known(vectors[:, None], length[:, None], length, noise, flatness)

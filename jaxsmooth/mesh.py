@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsmooth.elements import ElementType, element_type
 
@@ -24,12 +24,15 @@ class Labels(eqx.Module):
         features: lower-dimensional cells of the file, ``[m, k]`` each.
         feature_types: their types (``vertex``, ``line``, ``triangle``, …).
         feature_tags: one int array ``[m]`` each: cells of different tags do not mix.
+        held: nodes that must not move ``[nodes]``, or None: those that a file marks, and those that
+            belong together though no element says so.
     """
 
     regions: tuple[Int[np.ndarray, "_"], ...]
     features: tuple[Int[np.ndarray, "_ _"], ...] = ()
     feature_tags: tuple[Int[np.ndarray, "_"], ...] = ()
     feature_types: tuple[str, ...] = eqx.field(static=True, default=())
+    held: Bool[np.ndarray, " nodes"] | None = None
 
 
 class Mesh(eqx.Module):

@@ -7,14 +7,17 @@ changes coordinates, so writing means replacing them in a copy of the source.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import meshio
 import numpy as np
 
+from jaxsmooth.blocks import collected, count_orphans, oriented, placed, without_cohesive
+from jaxsmooth.coupling import find_coupled
 from jaxsmooth.elements import element_type
 from jaxsmooth.files.checks import (
     SYNONYMS,
@@ -23,11 +26,11 @@ from jaxsmooth.files.checks import (
     check_points,
     dimension,
     element_dim,
-    in_plane,
 )
 from jaxsmooth.files.labels import held_nodes, make_labels, make_named_sets, plain
+from jaxsmooth.layers import STRETCHED, boundary_layers, stretched
 from jaxsmooth.mesh import Mesh
-from jaxsmooth.orientation import orient
+from jaxsmooth.planes import Plane, find_plane
 
 __all__ = ["MeshFile", "MeshFileError", "as_mesh", "from_meshio", "to_meshio"]
 
@@ -43,10 +46,13 @@ class MeshFile:
         path: where it was read from, or None.
         format: the format it is written in again, such as ``"gmsh22:binary"``, or None.
         notes: sentences for the user about what was found, or done, on the way.
-        fixed: nodes that point or cell data called ``fixed`` hold ``[nodes]``.
+        fixed: nodes that point or cell data called ``fixed`` hold ``[nodes]``; `mesh.labels.held` has
+            them too, with the nodes that belong together.
         named_sets: nodes of every named set ``{name: [nodes]}``.
         placement: for every cell block of the source the block of `mesh` it went to (−1: none) and
-            the element there of each of its cells.
+            the element there of each of its cells (−1: none).
+        plane: for a plane mesh whose file has three coordinates a node, where in space it lies:
+            `mesh.points` are coordinates in this plane.  None otherwise.
     """
 
     mesh: Mesh
@@ -57,6 +63,7 @@ class MeshFile:
     fixed: np.ndarray
     named_sets: Mapping[str, np.ndarray]
     placement: tuple[tuple[int, np.ndarray], ...] = field(repr=False)
+    plane: Plane | None = field(default=None, repr=False)
 
 
 def from_meshio(
@@ -70,7 +77,10 @@ def from_meshio(
 
     Cell blocks of one type become one element block; elements that are numbered the other way round
     are mirrored (in `mesh`, not in `source`); lower-dimensional cells and material tags become
-    `Mesh.labels`.  The mesh is 2D when its highest cells are and all of them lie in one plane z = c.
+    `Mesh.labels`.  The mesh is 2D when its highest cells are and all of them lie in one plane, whichever
+    (but for noise of 1e-5 of its size).  Nodes that the file marks, or that belong together (periodic
+    pairs, parts in contact, hanging nodes, shells in a solid), are `Labels.held`; elements without
+    thickness (cohesive cells) are left out and their nodes held.
 
     Args:
         source: what meshio read.
@@ -79,8 +89,8 @@ def from_meshio(
         dtype: float32 or float64; by default that of the points (as far as JAX allows it).
 
     Raises:
-        MeshFileError: no elements, types that are not supported, surfaces in 3D, coordinates that
-            are not finite, elements that refer to missing nodes or to one node twice.
+        MeshFileError: no elements, none with a thickness, types that are not supported, surfaces in
+            3D, coordinates that are not finite, elements that refer to missing nodes or to one node twice.
     """
     points = plain(source.points)
     cells = [(SYNONYMS.get(c.type, c.type), c.data) for c in source.cells]
@@ -91,22 +101,29 @@ def from_meshio(
     names = list(dict.fromkeys(cells[k][0] for k in chosen))
     notes: list[str] = []
     parts = [[k for k in chosen if cells[k][0] == name] for name in names]
-    numbering, placement = [], [(-1, np.zeros(0, np.int64))] * len(cells)
-    first: list[np.ndarray] = []
-    for block, (name, own) in enumerate(zip(names, parts, strict=True)):
-        nodes = np.concatenate([np.asarray(cells[k][1]).astype(np.int64) for k in own])
-        kept, element = _distinct(name, nodes, notes)
-        numbering.append(nodes[kept])
-        first.append(kept)
-        ends = np.cumsum([len(cells[k][1]) for k in own])[:-1]
-        for k, rows in zip(own, np.split(element, ends), strict=True):
-            placement[k] = (block, rows)
-    points = in_plane(points, numbering, dim)
+    numbering, kept, element = collected(cells, names, parts, notes)
+    points, plane = _in_space(points, numbering, dim)
+    open_, held = without_cohesive(points, names, numbering, notes)
+    placement = placed(cells, parts, element, open_)
+    full = [b for b, rows in enumerate(open_) if rows.any()]
+    names, parts = [names[b] for b in full], [parts[b] for b in full]
+    numbering = [numbering[b][open_[b]] for b in full]
 
-    blocks = _oriented(points, names, numbering, notes)
-    _count_orphans(len(points), cells, notes)
-    labels = make_labels(source, cells, dim, parts, first)
+    blocks = oriented(points, names, numbering, notes)
+    count_orphans(len(points), cells, notes)
+    labels = make_labels(source, cells, dim, parts, [kept[b][open_[b]] for b in full])
     mesh = Mesh(_cast(points, dtype), blocks, labels)
+    fixed = held_nodes(source, len(points))
+    together, sentences = find_coupled(
+        points,
+        mesh,
+        [cell for k, cell in enumerate(cells) if k not in chosen],
+        getattr(source, "gmsh_periodic", None),
+        held,
+    )
+    notes += sentences + _stretch(mesh)
+    held |= fixed | together
+    mesh = mesh.with_labels(replace(labels, held=held if held.any() else None))
     if dtype is not None and mesh.points.dtype != np.dtype(dtype):
         notes.append(f"{np.dtype(dtype)} was asked for, but JAX runs without jax_enable_x64: float32 is used")
     return MeshFile(
@@ -115,9 +132,10 @@ def from_meshio(
         path=None if path is None else Path(path),
         format=format,
         notes=tuple(notes),
-        fixed=held_nodes(source, len(points)),
+        fixed=fixed,
         named_sets=make_named_sets(source, len(points)),
         placement=tuple(placement),
+        plane=plane,
     )
 
 
@@ -131,7 +149,8 @@ def to_meshio(
     """The file's mesh with other coordinates; all else is the source's, in the source's order.
 
     Coordinates that are equal to those of `file.mesh` are written as they were read, so a float32 run
-    leaves what it didn't move untouched; so are z in 2D and nodes outside of all elements.
+    leaves what it didn't move untouched; so are nodes outside of all elements, and what is normal to
+    the plane of a plane mesh.
 
     Args:
         file: what was read.
@@ -164,6 +183,9 @@ def to_meshio(
 def as_mesh(anything: Any) -> Mesh:
     """A `Mesh` from whatever is one: `Mesh`, `MeshFile`, `meshio.Mesh`, ``(points, {"tetra": nodes})``.
 
+    A `Mesh` comes back as it is, its points traced by JAX or not; all else is read as files are, so
+    that reversed elements are turned, and nodes that belong together are held.
+
     Raises:
         ValueError: it is none of these, or not a mesh that can be smoothed.
     """
@@ -174,7 +196,7 @@ def as_mesh(anything: Any) -> Mesh:
     if isinstance(anything, meshio.Mesh):
         return from_meshio(anything).mesh
     if isinstance(anything, (tuple, list)) and len(anything) == 2:
-        return Mesh(*anything)
+        return from_meshio(_from_pair(*anything)).mesh
     raise ValueError(
         f"can't take {type(anything).__name__} for a mesh; give a Mesh, a MeshFile (read(path)), "
         "a meshio.Mesh or (points, {'tetra': connectivity})"
@@ -182,6 +204,39 @@ def as_mesh(anything: Any) -> Mesh:
 
 
 # --- From the source ---------------------------------------------------------------------
+
+
+def _from_pair(points: Any, blocks: Any) -> meshio.Mesh:
+    """What a pair ``(points, {"tetra": nodes})`` says, as a file would say it."""
+    if isinstance(points, jax.core.Tracer):
+        raise ValueError(
+            "the numbering of elements can't be checked while JAX traces the points; build the mesh before, "
+            "by as_mesh((points, blocks)), and trace mesh.with_points(points)"
+        )
+    pairs = blocks.items() if isinstance(blocks, Mapping) else blocks
+    cells = [(str(name), np.asarray(nodes)) for name, nodes in pairs]
+    for index, (name, nodes) in enumerate(cells):
+        if name not in SYNONYMS and name != "vertex":
+            element_type(name)  # raises for unknown names
+        if nodes.ndim != 2 or nodes.dtype.kind not in "iu":
+            raise ValueError(
+                f"block {index} ({name}): connectivity must be integers of shape [elements, k], "
+                f"got {nodes.dtype} {list(nodes.shape)}"
+            )
+    return meshio.Mesh(np.asarray(points), cells)
+
+
+def _stretch(mesh: Mesh) -> list[str]:
+    """A note on elements that are stretched, if there are some."""
+    number = sum(int(mask.sum()) for mask in stretched(mesh))
+    if not number:
+        return []
+    layer = sum(int(mask.sum()) for mask in boundary_layers(mesh))
+    held = f", {layer} of them in boundary layers, whose nodes are held" if layer else ""
+    return [
+        f"{number} elements are stretched beyond {STRETCHED:g}{held}; --freeze-aspect A (freeze_aspect=A) "
+        "holds all those beyond A"
+    ]
 
 
 def _cast(points: np.ndarray, dtype: Any) -> np.ndarray:
@@ -192,68 +247,14 @@ def _cast(points: np.ndarray, dtype: Any) -> np.ndarray:
     return points.astype(dtype)
 
 
-def _distinct(name: str, nodes: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Rows to keep of a block ``[elements, k]``, and for every row its element among those.
-
-    Gmsh 2.2 files have an element once for each of its physical groups."""
-    every = np.arange(len(nodes))
-    weights = np.random.default_rng(0).integers(2**63, size=int(nodes.max()) + 1, dtype=np.uint64)
-    if len(np.unique(weights[nodes].sum(axis=1))) == len(nodes):  # the usual case, found fast
-        return every, every
-    kept, element = np.unique(np.sort(nodes, axis=1), axis=0, return_index=True, return_inverse=True)[1:]
-    if len(kept) == len(nodes):
-        return every, every
-    notes.append(
-        f"{len(nodes) - len(kept)} of the {len(nodes)} {name} cells repeat another one, as Gmsh writes "
-        "elements of several groups; each is used once, and written as often as it was"
-    )
-    order = np.argsort(kept)  # in the order of the file
-    return kept[order], np.argsort(order)[element.ravel()]
-
-
-def _oriented(points, names, numbering, notes: list[str]) -> list[tuple[str, np.ndarray]]:
-    """Blocks with reversed elements mirrored; notes on them, on tangled and on flat elements."""
-    kinds = [element_type(name) for name in names]
-    precision = np.finfo(points.dtype).eps if points.dtype.kind == "f" else np.finfo(np.float64).eps
-    points = points.astype(np.float64)
-    found = orient(points, list(zip(kinds, numbering, strict=True)))
-    blocks = []
-    for kind, nodes, reverse, measures in zip(kinds, numbering, found.reverse, found.measures, strict=True):
-        if reverse.any():
-            nodes = np.where(reverse[:, None], nodes[:, kind.mirror], nodes)
-            which = "all" if reverse.all() else str(int(reverse.sum()))
-            mixed = "" if reverse.all() else "the numbering of the file is mixed: "
-            notes.append(
-                f"{mixed}{which} of the {len(nodes)} {kind.name} elements are numbered the other way round; "
-                "they are turned for the computation and written in the file's own order"
-            )
-        corners = points[nodes[:, : kind.corners]]
-        size = np.ptp(corners, axis=1).max(axis=-1) + precision * np.abs(corners).max(axis=(1, 2))
-        flat = np.abs(measures) <= 64 * precision * size**kind.dim
-        if flat.any():
-            notes.append(
-                f"{int(flat.sum())} of the {len(nodes)} {kind.name} elements have zero measure, "
-                f"the first is {kind.name} {int(np.argmax(flat))} (counted from 0)"
-            )
-        inverted = (measures < 0) & ~flat
-        if inverted.any():
-            notes.append(
-                f"{int(inverted.sum())} of the {len(nodes)} {kind.name} elements are inverted (numbered "
-                f"like their neighbours, negative measure), first {kind.name} {int(np.argmax(inverted))}; "
-                "the mesh is tangled"
-            )
-        blocks.append((kind.name, nodes))
-    return blocks
-
-
-def _count_orphans(count: int, cells: Sequence[tuple[str, Any]], notes: list[str]) -> None:
-    used = np.zeros(count, bool)
-    for name, data in cells:
-        if len(data) and not name.startswith("polyhedron"):
-            nodes = np.asarray(data)
-            used[nodes[(nodes >= 0) & (nodes < count)]] = True
-    if not used.all():
-        notes.append(f"{int((~used).sum())} of the {count} nodes belong to no cell; they stay where they are")
+def _in_space(points: np.ndarray, numbering, dim: int) -> tuple[np.ndarray, Plane | None]:
+    """Points with as many coordinates as the elements have dimensions, and the plane they are in."""
+    if dim == 3 and points.shape[1] == 2:
+        raise MeshFileError("the file has volume elements but only two coordinates a node; it needs three")
+    if dim == 3 or points.shape[1] == 2:
+        return points, None
+    plane = find_plane(points[np.unique(np.concatenate([nodes.ravel() for nodes in numbering]))])
+    return plane.flatten(points), plane
 
 
 # --- To the source -----------------------------------------------------------------------
@@ -272,9 +273,9 @@ def _moved(file: MeshFile, points: Any) -> np.ndarray:
         used[np.asarray(nodes)] = True
     coarse = np.float32 if np.float32 in (old.dtype, new.dtype) else np.float64
     changed = used[:, None] & (new.astype(coarse) != old.astype(coarse))
-    dim = old.shape[1]
-    out[:, :dim] = np.where(changed, new, out[:, :dim])
-    return out
+    if file.plane is not None:
+        return file.plane.move(out, old, new, changed)
+    return np.where(changed, new, out)
 
 
 def _to_cells(file: MeshFile, name: str, values: Any) -> list[np.ndarray]:
@@ -291,8 +292,12 @@ def _to_cells(file: MeshFile, name: str, values: Any) -> list[np.ndarray]:
     for cells, (block, rows) in zip(file.source.cells, file.placement, strict=True):
         if block < 0:
             out.append(np.full((len(cells), *parts[0].shape[1:]), np.nan))
+        elif (rows < 0).any():
+            part = parts[block][rows].astype(np.float64)  # NaN needs a float
+            part[rows < 0] = np.nan
+            out.append(part)
         else:
             out.append(parts[block][rows])
-    if any(block < 0 for block, _ in file.placement):
-        out = [part.astype(np.float64) for part in out]  # NaN needs a float
+    if any(block < 0 or (rows < 0).any() for block, rows in file.placement):
+        out = [part.astype(np.float64) for part in out]
     return out

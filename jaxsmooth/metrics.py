@@ -10,6 +10,7 @@ import difflib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsmooth.elements import ElementType
-from jaxsmooth.mesh import Mesh, gather
+from jaxsmooth.mesh import gather
+from jaxsmooth.meshfile import as_mesh
 from jaxsmooth.small import contract, determinant, least, norm, power
 
 __all__ = ["METRICS", "Metric", "measure", "metric", "quality", "quality_mean", "surface"]
@@ -161,11 +163,11 @@ def _block_quality(kind: ElementType, name: str, points: Array, nodes: Int[Array
     return jax.vmap(partial(METRICS[name].function, kind))(gather(points, nodes))
 
 
-def quality(mesh: Mesh, name: str = "shape") -> tuple[Float[Array, " elements"], ...]:
+def quality(mesh: Any, name: str = "shape") -> tuple[Float[Array, " elements"], ...]:
     """A metric on every element.
 
     Args:
-        mesh: the mesh.
+        mesh: a `Mesh`, or whatever else `as_mesh` takes.
         name: a name of the `METRICS` table.
 
     Returns:
@@ -173,12 +175,12 @@ def quality(mesh: Mesh, name: str = "shape") -> tuple[Float[Array, " elements"],
         `min_jacobian` (length to the power of the dimension).
 
     Raises:
-        ValueError: for an unknown metric.
+        ValueError: for an unknown metric, or what is no mesh.
     """
-    row = metric(name)
+    row, mesh = metric(name), as_mesh(mesh)
     return tuple(_block_quality(kind, row.name, mesh.points, nodes) for kind, nodes in mesh.blocks)
 
 
-def quality_mean(mesh: Mesh, name: str = "shape") -> Scalar:
+def quality_mean(mesh: Any, name: str = "shape") -> Scalar:
     """Mean of a metric over all elements: a differentiable scalar."""
     return jnp.concatenate(quality(mesh, name)).mean()

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxsmooth.constraints import Constraints
 from jaxsmooth.mesh import Mesh
+from jaxsmooth.meshfile import as_mesh
 from jaxsmooth.methods import Elastic, Method
 from jaxsmooth.patches import evaluate
 from jaxsmooth.solve import project
@@ -24,17 +26,18 @@ Field = Float[Array, "nodes dim"]
 _UNNESTED = 16  # steps whose points alone are kept; more are nested, for memory ~ √steps
 
 
-def step(mesh: Mesh, method: Method, constraints: Constraints) -> Mesh:
+def step(mesh: Any, method: Method, constraints: Constraints) -> Mesh:
     """One step of a method, ``mesh -> mesh``: the differentiable atom of all runs.
 
     Derivatives go through quality, fit, forces and the solve; the fractions of the moves that
     the guard accepts are constants for them.
     """
+    mesh = as_mesh(mesh)
     before = jax.lax.stop_gradient(evaluate(mesh))
     return mesh.with_points(method.step(mesh, constraints, before).points)
 
 
-def run(mesh: Mesh, method: Method | None = None, *, constraints: Constraints, steps: int = 3) -> Mesh:
+def run(mesh: Any, method: Method | None = None, *, constraints: Constraints, steps: int = 3) -> Mesh:
     """A fixed number of steps.
 
     Reverse mode keeps, for every step, the points, the displacement and the guard's decision,
@@ -43,7 +46,7 @@ def run(mesh: Mesh, method: Method | None = None, *, constraints: Constraints, s
     tightly (`solve.gradient_tolerance`).
 
     Args:
-        mesh: the mesh; its points may be traced, batched, or both.
+        mesh: a `Mesh`, whose points may be traced, batched, or both; or whatever else `as_mesh` takes.
         method: `Elastic()` by default.
         constraints: how nodes may move (found beforehand, from concrete points).
         steps: number of steps (static).
@@ -51,6 +54,7 @@ def run(mesh: Mesh, method: Method | None = None, *, constraints: Constraints, s
     Returns:
         The smoothed mesh.
     """
+    mesh = as_mesh(mesh)
     method = _prepared(method, mesh)
     saved = jax.checkpoint_policies.save_only_these_names("displacement", "accepted")
 
@@ -95,7 +99,7 @@ class FixedPoint(eqx.Module):
 
 
 def fixed_point(
-    mesh: Mesh,
+    mesh: Any,
     method: Method | None = None,
     *,
     constraints: Constraints,
@@ -110,7 +114,7 @@ def fixed_point(
     and no dependence on where the free nodes started.
 
     Args:
-        mesh: the start; near enough to a valid mesh that no guard is needed.
+        mesh: the start, a mesh as for `run`; near enough to a valid mesh that no guard is needed.
         method: `Elastic()` by default; solved tightly throughout.
         constraints: how nodes may move.
         tolerance: on the largest move, relative to the size of the domain.
@@ -119,6 +123,7 @@ def fixed_point(
     Returns:
         The mesh, the number of steps and the last change: compare it with `tolerance`.
     """
+    mesh = as_mesh(mesh)
     method = _prepared(method, mesh)
     method = eqx.tree_at(lambda m: m.guard, method, None, is_leaf=lambda x: x is None)
     stopped = jax.lax.stop_gradient

@@ -9,7 +9,7 @@ import numpy as np
 from jaxsmooth.elements import ElementType, element_type
 from jaxsmooth.mesh import Mesh
 
-__all__ = ["Facets", "find_facets", "node_pairs", "signed_measures"]
+__all__ = ["Facets", "facet_keys", "find_facets", "lengths", "node_pairs", "pair_codes", "signed_measures"]
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,10 @@ class Facets:
     nodes: np.ndarray
     region: np.ndarray
     partner: np.ndarray
+
+    def select(self, chosen: np.ndarray) -> Facets:
+        """The facets of a mask ``[facets]``."""
+        return Facets(self.type, self.nodes[chosen], self.region[chosen], self.partner[chosen])
 
 
 def find_facets(mesh: Mesh) -> list[Facets]:
@@ -91,6 +95,16 @@ def _regions(mesh: Mesh) -> list[np.ndarray]:
     tags = np.concatenate([np.asarray(part) for part in mesh.labels.regions])
     numbers = np.unique(tags, return_inverse=True)[1].reshape(-1)
     return np.split(numbers, np.cumsum(sizes)[:-1])
+
+
+def lengths(points: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Distances between the two nodes of pairs ``[…, 2]``."""
+    return np.linalg.norm(points[pairs[..., 1]] - points[pairs[..., 0]], axis=-1)
+
+
+def pair_codes(pairs: np.ndarray, count: int) -> np.ndarray:
+    """One integer for every pair of nodes ``[…, 2]`` of a mesh of `count`, whichever comes first."""
+    return pairs.min(axis=-1).astype(np.int64) * count + pairs.max(axis=-1)
 
 
 def node_pairs(mesh: Mesh) -> np.ndarray:

@@ -307,3 +307,80 @@ def test_quadratic_and_linear_elements_share_facets():
     found = detect_constraints(Mesh(points, {**raised, "hexahedron": upper[None]}))
     sides = meshes.box_normals(points)
     np.testing.assert_array_equal(found.freedom, [3 - len(s) for s in sides])
+
+
+# --- Facets without a direction, and units -----------------------------------------------------
+
+
+def with_doubled_corner(offset=0.0):
+    """A unit square whose corner has a second boundary node on it: a side without length."""
+    points = 1 / 3 + np.array([[0.0, 0], [1, 0], [1, 1], [0, 1], [offset, 0], [0.5, 0.5]])
+    triangles = np.array([[0, 4, 5], [4, 1, 5], [1, 2, 5], [2, 3, 5], [3, 0, 5]])
+    return Mesh(points, {"triangle": triangles})
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e-16])
+def test_a_side_without_length_frees_nobody(offset):
+    np.testing.assert_array_equal(detect_constraints(with_doubled_corner(offset)).freedom, [0, 0, 0, 0, 0, 2])
+    np.testing.assert_array_equal(detect_constraints(with_doubled_corner(0.5)).freedom, [0, 0, 0, 0, 1, 2])
+
+
+def test_nodes_that_coincide_on_a_flat_side_still_slide_along_it():
+    points = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1], [0.5, 0], [0.5, 0], [0.5, 0.5]])
+    triangles = np.array([[0, 4, 6], [4, 5, 6], [5, 1, 6], [1, 2, 6], [2, 3, 6], [3, 0, 6]])
+    found = detect_constraints(Mesh(points, {"triangle": triangles}))
+    np.testing.assert_array_equal(np.asarray(found.projectors)[[4, 5]], [np.diag([1.0, 0.0])] * 2)
+
+
+def test_a_face_without_area_frees_nobody():
+    """A tetrahedron flat against the edge of a box: its boundary face has three nodes in a row."""
+    points, blocks = meshes.grid("tetra", (1, 1, 1))
+    edge = np.flatnonzero((points[:, 1] == 0) & (points[:, 2] == 0))
+    points = np.concatenate([points, [points[edge].mean(axis=0)]])
+    tetra = blocks["tetra"]
+    inner = np.setdiff1d(np.arange(8), edge)
+    touching = tetra[np.isin(tetra, edge).sum(axis=1) == 2]
+    third = np.setdiff1d(touching[0], edge)[0]
+    cells = np.concatenate([tetra, [[*edge, 8, third]]])
+    freedom = detect_constraints(Mesh(points, {"tetra": cells})).freedom
+    assert freedom[8] <= 1
+    np.testing.assert_array_equal(freedom[edge], 0)
+    assert len(inner) == 6
+
+
+def turned_box():
+    points, blocks = meshes.mixed_3d(0.1)
+    return 3 * points @ meshes.rotation_matrix(3, 4).T + 1, blocks
+
+
+def few_digits():
+    points, blocks = meshes.grid("hexahedron", (4, 4, 4))
+    return points * [1.0, 0.3, 2.7] + 0.1, blocks
+
+
+SCALED = {
+    "dyadic": lambda: meshes.grid("hexahedron", (4, 4, 4)),
+    "few digits": few_digits,
+    "full": turned_box,
+    "pipe": lambda: pipe("hexahedron20")[1:],
+    "quarters": lambda: meshes.grid("triangle", (4, 4)),
+}
+
+
+@pytest.mark.parametrize("name", SCALED)
+@pytest.mark.parametrize("power", [-30, 20])
+def test_units_that_differ_by_a_power_of_two_change_nothing(name, power):
+    points, blocks = SCALED[name]()
+    one = np.asarray(detect_constraints(Mesh(points, blocks)).projectors)
+    other = np.asarray(detect_constraints(Mesh(points * 2.0**power, blocks)).projectors)
+    assert one.dtype == np.float64
+    np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("name", SCALED)
+def test_projectors_are_exact(name):
+    found = np.asarray(detect_constraints(Mesh(*SCALED[name]())).projectors)
+    np.testing.assert_array_equal(found, found.swapaxes(1, 2))
+    np.testing.assert_allclose(found @ found, found, atol=1e-15)
+    if name in ("dyadic", "few digits", "quarters"):  # sides normal to the axes
+        assert set(np.unique(found)) == {0.0, 1.0}

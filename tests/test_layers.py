@@ -7,10 +7,11 @@ PACKAGE = Path(__file__).parents[1] / "jaxsmooth"
 ORDER = [
     ("acceptance", "quadrature"),
     ("elements",),
-    ("mesh", "small"),
+    ("mesh", "small", "rounding"),
     ("topology",),
-    ("orientation", "files.cards", "files.checks", "files.regions"),
+    ("orientation", "cohesive", "hanging", "layers", "files.cards", "files.checks", "files.regions"),
     ("files.labels",),
+    ("blocks", "coupling", "planes"),
     ("meshfile",),
     ("metrics", "constraints", "fitting", "elasticity"),
     ("patches", "solve", "distortion"),

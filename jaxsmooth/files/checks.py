@@ -20,7 +20,6 @@ __all__ = [
     "check_references",
     "dimension",
     "element_dim",
-    "in_plane",
     "parse_numbers",
 ]
 
@@ -141,22 +140,6 @@ def check_references(mesh: Any) -> None:
 
 def _cell(first: np.ndarray, block: int, row: int, name: str) -> str:
     return f"cell {first[block] + row} of the file ({name} {row} of cell block {block}, counted from 0)"
-
-
-def in_plane(points: np.ndarray, numbering: Sequence[np.ndarray], dim: int) -> np.ndarray:
-    """Points ``[nodes, dim]`` of elements of this dimension; raises `MeshFileError` for surfaces."""
-    if dim == 3 and points.shape[1] == 2:
-        raise MeshFileError("the file has volume elements but only two coordinates a node; it needs three")
-    if dim == 3 or points.shape[1] == 2:
-        return points
-    used = points[np.unique(np.concatenate([nodes.ravel() for nodes in numbering]))]
-    # files written with nine digits or so are still plane
-    if np.ptp(used[:, 2]) > 1e-9 * np.ptp(used[:, :2], axis=0).max():
-        raise MeshFileError(
-            "the mesh is a surface in 3D (plane elements whose z is not constant), which can't be smoothed; "
-            "give volume elements, or a plane mesh in x and y"
-        )
-    return points[:, :2]
 
 
 def check_last_line(content: bytes, comment: bytes = b"#") -> None:

@@ -146,6 +146,7 @@ def _clean(mesh: meshio.Mesh, stem: str, dim: int, notes: list[str]) -> meshio.M
     ]
     out.points = plain(mesh.points)
     if stem == "su2" and dim == 2:  # its dimension is the number of coordinates
+        _check_upright(out)
         out.points = out.points[:, :2]
     elif stem in (*VTK_FORMATS, "xdmf", "gmsh22", "abaqus") and out.points.shape[1] == 2:
         out.points = np.pad(out.points, ((0, 0), (0, 1)))
@@ -194,6 +195,17 @@ def _array(values, stem: str) -> np.ndarray | None:
     if stem in VTK_FORMATS and values.ndim == 2 and values.shape[1] == 2:
         values = np.pad(values, ((0, 0), (0, 1)))  # VTK's vectors have three components
     return values
+
+
+def _check_upright(mesh: meshio.Mesh) -> None:
+    """Raise `MeshFileError` where x and y alone would not say where plane elements are."""
+    nodes = np.unique(np.concatenate([cells.data.ravel() for cells in mesh.cells if cells.dim == 2]))
+    extent = np.ptp(mesh.points[nodes], axis=0)
+    if len(extent) == 3 and extent[2] > 1e-5 * extent[:2].max():
+        raise MeshFileError(
+            "su2 files hold x and y of plane meshes and nothing else, but this one lies in another plane; "
+            "choose another format"
+        )
 
 
 # --- Writers -----------------------------------------------------------------------------
