@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import io
 import json
 import math
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 from jaxsmooth import __version__
 from jaxsmooth.outputs import Outputs, interruptible
+from jaxsmooth.terminal import (
+    close_standard_output,
+    complain,
+    prepare_streams,
+    sentence,
+    write_to_standard_output,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -40,9 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
         The exit code: 0 done; 2 bad input or usage, nothing written; 3 done, but inverted elements
         remain; 130 interrupted.
     """
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # σ and names of files, to any terminal
+    prepare_streams()
     outputs = Outputs()
     try:
         with interruptible(), outputs:
@@ -50,57 +52,22 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         outputs.discard()
         written = f"all was done, and {', '.join(outputs.written)} written" if outputs.written else ""
-        _complain(f"interrupted; {written or 'nothing was written'}")
+        complain(f"interrupted; {written or 'nothing was written'}")
         return INTERRUPTED
     finally:
-        _close_standard_output()
+        close_standard_output()
 
 
 def _run_command(options: argparse.Namespace, outputs: Outputs) -> int:
     try:
         _set_up_jax(getattr(options, "precision", "float64"))
         return options.run(options, outputs)
-    except (ValueError, OSError, ImportError, MemoryError, RuntimeError) as error:
-        sentence = _sentence(error)
-        if sentence is None:
+    except Exception as error:
+        text = sentence(error)
+        if text is None:
             raise
-        _complain(sentence)
+        complain(text)
         return BAD_INPUT
-
-
-def _sentence(error: BaseException) -> str | None:
-    """What to tell the user; None for errors of the program itself."""
-    if _out_of_memory(error):
-        return "out of memory; use a machine with more of it, --precision float32 or a smaller mesh"
-    if isinstance(error, RuntimeError):
-        return None
-    if isinstance(error, OSError) and error.errno is not None:
-        return f"{error.filename or 'standard output'}: {error.strerror}"
-    return " ".join(str(error).splitlines())
-
-
-def _out_of_memory(error: BaseException | None) -> bool:
-    """NumPy's, JAX's and C++'s ways to say it; those who read and write meshes wrap it."""
-    while error is not None:
-        words = ("RESOURCE_EXHAUSTED", "bad_alloc") if isinstance(error, RuntimeError) else ()
-        if isinstance(error, MemoryError) or any(word in str(error) for word in words):
-            return True
-        error = error.__cause__
-    return False
-
-
-def _complain(sentence: str) -> None:
-    with contextlib.suppress(OSError):  # nobody to tell
-        print(f"jaxsmooth: {sentence}", file=sys.stderr)
-
-
-def _close_standard_output() -> None:
-    """Python flushes once more at its end: what failed (``| head``) would fail again, with a traceback."""
-    try:
-        if sys.stdout is not None:
-            sys.stdout.flush()
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -378,19 +345,15 @@ def _print_losses(out: Console, notes: Sequence[str], output: str) -> None:
 
     report.print_notes(out, notes)
     for note in notes if out.quiet else ():
-        _complain(f"{output}: {note}")
+        complain(f"{output}: {note}")
 
 
 def _write_json(outputs: Outputs, path: str, content: dict[str, Any]) -> None:
     text = json.dumps(content, indent=1, allow_nan=False, default=str) + "\n"
-    if path != "-":
-        outputs.text(path, text)
-    elif sys.stdout is None:
-        raise ValueError("--json -: standard output is closed; name a file")
+    if path == "-":
+        write_to_standard_output(text)
     else:
-        with contextlib.suppress(BrokenPipeError):  # the reader has read enough
-            sys.stdout.write(text)
-            sys.stdout.flush()
+        outputs.text(path, text)
 
 
 def _finish(out: Console, outputs: Outputs, message: str) -> None:
@@ -399,7 +362,7 @@ def _finish(out: Console, outputs: Outputs, message: str) -> None:
     try:
         out.print(message.format(", ".join(outputs.written)))
     except OSError as error:
-        _complain(f"{', '.join(outputs.written)} written, but not standard output ({error.strerror})")
+        complain(f"{', '.join(outputs.written)} written, but not standard output ({error.strerror})")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "jaxsmooth"
 ORDER = [
-    ("quadrature", "outputs"),
+    ("quadrature", "outputs", "terminal"),
     ("elements",),
     ("mesh", "small"),
     ("topology",),
