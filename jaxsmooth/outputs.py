@@ -23,11 +23,12 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from types import FrameType
 from typing import NamedTuple
 
 __all__ = ["Outputs", "interruptible", "uninterrupted"]
 
-_SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, n)]
+_ENDS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name)]
 
 
 class _Output(NamedTuple):
@@ -201,39 +202,38 @@ def _keep(part: Path, target: Path, old: Path) -> Path | None:
 
 @contextlib.contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Let interrupts wait until the block is done."""
-    if threading.current_thread() is not threading.main_thread():  # no other thread gets any
+    """Let Ctrl-C, and what `interruptible` takes for it, wait until the block is done."""
+    main = threading.current_thread() is threading.main_thread()  # no other thread gets signals
+    if not main or signal.getsignal(signal.SIGINT) is None:
         yield
         return
     late: list[int] = []
-    handlers = {s: signal.getsignal(s) for s in _SIGNALS}
-    handlers = {s: h for s, h in handlers.items() if h not in (None, signal.SIG_IGN)}
+    before = signal.signal(signal.SIGINT, lambda number, frame: late.append(number))
     try:
-        for number in handlers:
-            signal.signal(number, lambda number, frame: late.append(number))
         yield
     finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+        signal.signal(signal.SIGINT, before)
         if late:
             signal.raise_signal(late[0])
 
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """What would end the process at once raises KeyboardInterrupt, so that it can clean up."""
+    """Take what would end the process at once for Ctrl-C, so that it can clean up."""
 
-    def interrupt(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        handler = signal.getsignal(signal.SIGINT)
+        if not callable(handler):  # ignored, as in background jobs
+            raise KeyboardInterrupt
+        handler(number, frame)
 
-    changed = {}
+    changed: list[int] = []
     if threading.current_thread() is threading.main_thread():
-        changed = {s: signal.getsignal(s) for s in _SIGNALS}
-        changed = {s: h for s, h in changed.items() if h == signal.SIG_DFL}  # nohup ignores SIGHUP
+        changed = [s for s in _ENDS if signal.getsignal(s) == signal.SIG_DFL]  # nohup ignores SIGHUP
     try:
         for number in changed:
             signal.signal(number, interrupt)
         yield
     finally:
-        for number, handler in changed.items():
-            signal.signal(number, handler)
+        for number in changed:
+            signal.signal(number, signal.SIG_DFL)
