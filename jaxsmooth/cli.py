@@ -141,7 +141,7 @@ def _add_run_options(command: argparse.ArgumentParser) -> None:
     add("--fix", action="append", default=[], metavar="NAME", help=help)
     help = "write history and timings, - for standard output (default: none)"
     add("--json", metavar="FILE", help=help)
-    help = "print only errors, and what OUT can't hold (default: progress and a table)"
+    help = "print only errors, what OUT can't hold, and what stays inverted (default: progress and a table)"
     add("-q", "--quiet", action="store_true", help=help)
     _add_precision(command)
 
@@ -171,14 +171,16 @@ def _smooth(options: argparse.Namespace, outputs: Outputs) -> int:
         file = read(options.input)
     check_types(file.mesh.types, Path(options.output), output_format(options.output, file))
     report.print_file(out, file)
+    with clock("write"), Outputs() as trial:  # what a writer refuses, it refuses before the work
+        notes = write_to(trial, options.output, file, force=options.force)
+    _print_losses(out, notes, options.output)
     with clock("constraints"):
         constraints = _constraints(file, options)
     report.print_constraints(out, constraints)
     with clock("smooth"):
         result = _run(file, method, options.steps, constraints, lambda row: report.print_step(out, row))
     with clock("write"):
-        notes = write_to(outputs, options.output, file, result, force=options.force)
-    _print_losses(out, notes, options.output)
+        write_to(outputs, options.output, file, result, force=options.force)
     report.print_comparison(out, file.mesh, result)
     if options.report is not None:
         outputs.text(options.report, report.html_page(Path(options.input).name, file.mesh, result))
@@ -186,8 +188,12 @@ def _smooth(options: argparse.Namespace, outputs: Outputs) -> int:
         notes, seconds = (*file.notes, *notes), clock.split()
         row = report.as_json(options.input, options.output, options.method, result, seconds, notes)
         _write_json(outputs, options.json, row)
-    _finish(out, outputs, f"{result.status}; wrote {{}} in {sum(clock.seconds.values()):.1f} s")
-    return DONE if result.history[-1].statistics.inverted == 0 else INVERTED
+    inverted = result.history[-1].statistics.inverted
+    remain = f"; {inverted:,} inverted elements remain" if inverted else ""
+    _finish(out, outputs, f"{result.status}{remain}; wrote {{}} in {sum(clock.seconds.values()):.1f} s")
+    if inverted and out.quiet:
+        complain(f"{options.output}: {inverted:,} inverted elements remain")
+    return INVERTED if inverted else DONE
 
 
 def _quality(options: argparse.Namespace, outputs: Outputs) -> int:

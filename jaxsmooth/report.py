@@ -51,8 +51,11 @@ class Clock:
     def __call__(self, phase: str) -> Iterator[None]:
         start, compiled = time.perf_counter(), _compile_seconds()
         yield
-        self.seconds[phase] = time.perf_counter() - start
-        self._compiled[phase] = _compile_seconds() - compiled
+        for total, spent in (
+            (self.seconds, time.perf_counter() - start),
+            (self._compiled, _compile_seconds() - compiled),
+        ):
+            total[phase] = total.get(phase, 0.0) + spent
 
     def split(self) -> dict[str, float]:
         """The phases with compilation taken out of them and shown as a phase of its own."""

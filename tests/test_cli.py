@@ -113,16 +113,18 @@ def test_inverted_elements_give_exit_code_3(tmp_path, capsys):
         tmp_path / "in.vtk"
     )
     assert run("quality", tmp_path / "in.vtk") == 3
+    capsys.readouterr()
     assert run("smooth", tmp_path / "in.vtk", tmp_path / "out.vtk", "--steps", 0) == 3
+    assert "inverted elements remain; wrote" in capsys.readouterr().out
+    assert run("smooth", tmp_path / "in.vtk", tmp_path / "out.vtk", "--steps", 0, "-q") == 3
+    assert "inverted elements remain" in capsys.readouterr().err
     assert (tmp_path / "out.vtk").exists()
 
 
 def history(part, out, *options):
-    assert (
-        run("smooth", part, out, "-q", "--json", out.with_suffix(".json"), "--method", "laplacian", *options)
-        == 0
-    )
-    return json.loads(out.with_suffix(".json").read_text())["steps"]
+    numbers = out.with_suffix(".json")
+    assert run("smooth", part, out, "-q", "--json", numbers, "--method", "laplacian", *options) == 0
+    return json.loads(numbers.read_text())["steps"]
 
 
 def test_steps_are_exact(part, tmp_path):

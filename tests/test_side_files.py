@@ -330,6 +330,14 @@ def test_what_a_format_needs_is_asked_before_the_work(part, out, capsys, monkeyp
     one_sentence(capsys, "needs h5py")
 
 
+def test_what_a_writer_refuses_is_known_before_the_work(part, out, capsys, monkeypatch):
+    monkeypatch.setattr(smoothing, "smooth", raising(AssertionError("the work has begun")))
+    monkeypatch.setattr(meshio, "write", raising(ValueError("no place for this")))
+    assert run("smooth", part, out / "a.vtu") == 2
+    one_sentence(capsys, "no place for this")
+    assert content(out) == {}
+
+
 # --- What goes wrong during the work ---------------------------------------------------
 
 
