@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import math
 import sys
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxsmooth import __version__
-from jaxsmooth.outputs import Outputs, interruptible
+from jaxsmooth.outputs import Outputs, ending
 from jaxsmooth.terminal import (
     close_standard_output,
     complain,
@@ -40,22 +41,32 @@ _GOALS = ("average", "worst", "balanced")
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line.
 
+    Args:
+        arguments: its words; None for those of this process, which an interrupt then ends.
+
     Returns:
         The exit code: 0 done; 2 bad input or usage, nothing written; 3 done, but inverted elements
         remain; 130 interrupted.
     """
     prepare_streams()
     outputs = Outputs()
+    program = contextlib.nullcontext()
+    if arguments is None:
+        program = ending(lambda: _interrupted(outputs), INTERRUPTED)
     try:
-        with interruptible(), outputs:
+        with program, outputs:
             return _run_command(_parser().parse_args(arguments), outputs)
     except KeyboardInterrupt:
-        outputs.discard()
-        written = f"all was done, and {', '.join(outputs.written)} written" if outputs.written else ""
-        complain(f"interrupted; {written or 'nothing was written'}")
+        _interrupted(outputs)
         return INTERRUPTED
     finally:
         close_standard_output()
+
+
+def _interrupted(outputs: Outputs) -> None:
+    outputs.discard()
+    written = f"all was done, and {', '.join(outputs.written)} written" if outputs.written else ""
+    complain(f"interrupted; {written or 'nothing was written'}")
 
 
 def _run_command(options: argparse.Namespace, outputs: Outputs) -> int:

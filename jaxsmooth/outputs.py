@@ -21,14 +21,15 @@ import signal
 import stat
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
 
-__all__ = ["Outputs", "interruptible", "uninterrupted"]
+__all__ = ["Outputs", "ending", "uninterrupted"]
 
-_ENDS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name)]
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
+_INTERRUPTS = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
 
 
 class _Output(NamedTuple):
@@ -202,7 +203,7 @@ def _keep(part: Path, target: Path, old: Path) -> Path | None:
 
 @contextlib.contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Let Ctrl-C, and what `interruptible` takes for it, wait until the block is done."""
+    """Let Ctrl-C, and what `ending` takes for it, wait until the block is done."""
     main = threading.current_thread() is threading.main_thread()  # no other thread gets signals
     if not main or signal.getsignal(signal.SIGINT) is None:
         yield
@@ -218,22 +219,35 @@ def uninterrupted() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def interruptible() -> Iterator[None]:
-    """Take what would end the process at once for Ctrl-C, so that it can clean up."""
+def ending(clean_up: Callable[[], None], code: int) -> Iterator[None]:
+    """Let an interrupt end the process: for programs, not for what they call.
 
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        handler = signal.getsignal(signal.SIGINT)
-        if not callable(handler):  # ignored, as in background jobs
-            raise KeyboardInterrupt
-        handler(number, frame)
+    An exception would have to pass through code that does not expect it: imports that are cut short
+    end in a crash, callbacks of JAX swallow it.
 
-    changed: list[int] = []
-    if threading.current_thread() is threading.main_thread():
-        changed = [s for s in _ENDS if signal.getsignal(s) == signal.SIG_DFL]  # nohup ignores SIGHUP
+    Args:
+        clean_up: called first.
+        code: the exit code.
+    """
+
+    def end(number: int, frame: FrameType | None) -> None:
+        waiting = signal.getsignal(signal.SIGINT)
+        if callable(waiting) and waiting is not end:  # `uninterrupted`
+            waiting(number, frame)
+            return
+        for other in taken:
+            signal.signal(other, signal.SIG_IGN)
+        clean_up()
+        os._exit(code)
+
+    # what is ignored stays so (nohup, background jobs)
+    usual = (signal.SIG_DFL, signal.default_int_handler)
+    before = {number: signal.getsignal(number) for number in _INTERRUPTS}
+    taken = {number: handler for number, handler in before.items() if handler in usual}
     try:
-        for number in changed:
-            signal.signal(number, interrupt)
+        for number in taken:
+            signal.signal(number, end)
         yield
     finally:
-        for number in changed:
-            signal.signal(number, signal.SIG_DFL)
+        for number, handler in taken.items():
+            signal.signal(number, handler)

@@ -39,9 +39,13 @@ def _out_of_memory(error: BaseException | None) -> bool:
 
 
 def complain(text: str) -> None:
-    """A line on standard error."""
-    with contextlib.suppress(OSError):  # nobody to tell
-        print(f"jaxsmooth: {text}", file=sys.stderr)
+    """A line on standard error; also from within a signal handler, where a stream may be in use."""
+    line = f"jaxsmooth: {text}\n"
+    # nobody to tell; or RuntimeError: an interrupt came while the stream was written
+    with contextlib.suppress(OSError, RuntimeError):
+        if sys.stderr is not None:
+            sys.stderr.write(line)
+            sys.stderr.flush()
 
 
 def write_to_standard_output(text: str) -> None:

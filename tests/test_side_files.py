@@ -23,7 +23,6 @@ from jaxsmooth import smoothing
 from jaxsmooth.cli import main
 from jaxsmooth.files import exports
 from jaxsmooth.meshfile import MeshFileError
-from jaxsmooth.outputs import Outputs, interruptible
 
 
 def run(*arguments):
@@ -69,150 +68,6 @@ def one_sentence(capsys, *parts):
     for text in parts:
         assert text in error
     return error
-
-
-# --- The module of outputs -------------------------------------------------------------
-
-
-def write_three(outputs, folder):
-    """What `main` does, with three small files."""
-    try:
-        with interruptible(), outputs:
-            outputs.folder(folder / "new" / "deep")
-            for name in ("a.txt", "b.txt", "new/deep/c.txt"):
-                outputs.text(folder / name, "new")
-            outputs.commit()
-    except KeyboardInterrupt:
-        outputs.discard()
-
-
-def interrupted_at(line, number, folder):
-    """Run `write_three`, with a signal before a line that Python executes in it."""
-    outputs, seen, sent = Outputs(), 0, False
-    modules = ("outputs.py", "contextlib.py", "tempfile.py")
-
-    def trace(frame, event, argument):
-        nonlocal seen, sent
-        if event == "line" and frame.f_code.co_filename.endswith(modules):
-            seen += 1
-            if seen >= line and not sent and signal.getsignal(number) != signal.SIG_DFL:
-                sent = True
-                signal.raise_signal(number)
-        return trace
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        write_three(outputs, folder)
-    finally:
-        sys.settrace(before)
-    return outputs.written, sent
-
-
-SPACING = int(os.environ.get("JAXSMOOTH_LINES", "13"))  # 1: every line, two minutes
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupt_at_any_line(number, tmp_path):
-    line, sent, outcomes = 1, True, []
-    while sent:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        signal.signal(signal.SIGHUP, signal.SIG_DFL)
-        folder = tmp_path / str(line)
-        folder.mkdir()
-        (folder / "a.txt").write_text("old")
-        written, sent = interrupted_at(line, number, folder)
-        files = {str(p.relative_to(folder)): p.read_text() for p in folder.rglob("*") if p.is_file()}
-        if written:
-            assert files == {"a.txt": "new", "b.txt": "new", "new/deep/c.txt": "new"}, line
-        else:
-            assert files == {"a.txt": "old"}, line
-        assert sorted(p.name for p in folder.iterdir()) == sorted({f.split("/")[0] for f in files}), line
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler, line
-        outcomes.append(bool(written))
-        line += SPACING
-    assert outcomes.count(False) > 20
-    assert outcomes.count(True) > 2  # the last of them without any signal
-
-
-def test_an_interrupt_that_was_ignored_stays_ignored(tmp_path):
-    old = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as under nohup
-    try:
-        with interruptible():
-            signal.raise_signal(signal.SIGHUP)
-            write_three(Outputs(), tmp_path)
-            signal.raise_signal(signal.SIGHUP)
-    finally:
-        signal.signal(signal.SIGHUP, old)
-    assert (tmp_path / "a.txt").read_text() == "new"
-
-
-def test_a_rename_that_fails_undoes_the_others(tmp_path, monkeypatch):
-    (tmp_path / "a").write_text("old a")
-    (tmp_path / "c").write_text("old c")
-    rename, count = os.replace, 0
-
-    def fail_third(source, target):
-        nonlocal count
-        count += 1
-        if count == 3:
-            raise PermissionError(errno.EPERM, "Operation not permitted", source)
-        rename(source, target)
-
-    monkeypatch.setattr(os, "replace", fail_third)
-    with Outputs() as outputs:
-        for name in "abc":
-            outputs.text(tmp_path / name, "new")
-        with pytest.raises(PermissionError) as caught:
-            outputs.commit()
-    assert caught.value.filename == str(tmp_path / "c")
-    assert outputs.written == ()
-    assert content(tmp_path) == {"a": b"old a", "c": b"old c"}
-    assert sorted(os.listdir(tmp_path)) == ["a", "c"]
-
-
-def test_modes_links_and_the_umask(tmp_path):
-    (tmp_path / "real").mkdir()
-    target, link, fresh = tmp_path / "real" / "a.txt", tmp_path / "link.txt", tmp_path / "fresh.txt"
-    target.write_text("old")
-    target.chmod(0o640)
-    link.symlink_to(Path("real") / "a.txt")
-    dangling = tmp_path / "dangling.txt"
-    dangling.symlink_to(Path("real") / "b.txt")
-    twin = tmp_path / "twin.txt"
-    os.link(target, twin)
-    umask = os.umask(0o027)
-    try:
-        with Outputs() as outputs:
-            for path in (link, fresh, dangling):
-                outputs.text(path, "new")
-            outputs.commit()
-    finally:
-        os.umask(umask)
-    assert link.is_symlink()
-    assert dangling.is_symlink()
-    assert (target.read_text(), (tmp_path / "real" / "b.txt").read_text()) == ("new", "new")
-    assert target.stat().st_mode & 0o777 == 0o640
-    assert fresh.stat().st_mode & 0o777 == 0o640  # 0666 less the umask
-    assert twin.read_text() == "old"
-    assert outputs.written == (str(link), str(fresh), str(dangling))
-    assert sorted(os.listdir(tmp_path / "real")) == ["a.txt", "b.txt"]
-
-
-def test_formats_of_two_files(part, out):
-    """Tetgen's nodes and elements go together, and never over a file that is not theirs."""
-    file = js.read(part)
-    js.write(out / "a.node", file)
-    assert sorted(os.listdir(out)) == ["a.ele", "a.node"]
-    assert len(meshio.read(out / "a.ele").points) == len(file.mesh.points)
-    js.write(out / "a.node", js.read(out / "a.node"), force=True)
-    (out / "b.ele").write_text("precious")
-    with pytest.raises(MeshFileError, match=r"b\.ele: .*replaced together with .*b\.node"):
-        js.write(out / "b.node", file)
-    with pytest.raises(MeshFileError, match="replaced together"):
-        js.write(out / "a.ele", js.read(out / "a.node"))
-    assert (out / "b.ele").read_text() == "precious"
-    assert sorted(os.listdir(out)) == ["a.ele", "a.node", "b.ele"]
 
 
 # --- What is refused before the work ---------------------------------------------------
@@ -338,6 +193,22 @@ def test_what_a_writer_refuses_is_known_before_the_work(part, out, capsys, monke
     assert content(out) == {}
 
 
+def test_formats_of_two_files(part, out):
+    """Tetgen's nodes and elements go together, and never over a file that is not theirs."""
+    file = js.read(part)
+    js.write(out / "a.node", file)
+    assert sorted(os.listdir(out)) == ["a.ele", "a.node"]
+    assert len(meshio.read(out / "a.ele").points) == len(file.mesh.points)
+    js.write(out / "a.node", js.read(out / "a.node"), force=True)
+    (out / "b.ele").write_text("precious")
+    with pytest.raises(MeshFileError, match=r"b\.ele: .*replaced together with .*b\.node"):
+        js.write(out / "b.node", file)
+    with pytest.raises(MeshFileError, match="replaced together"):
+        js.write(out / "a.ele", js.read(out / "a.node"))
+    assert (out / "b.ele").read_text() == "precious"
+    assert sorted(os.listdir(out)) == ["a.ele", "a.node", "b.ele"]
+
+
 # --- What goes wrong during the work ---------------------------------------------------
 
 
@@ -409,15 +280,14 @@ STAGES = {
 
 
 @pytest.mark.parametrize("stage", STAGES)
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_interrupts(stage, number, part, out, capsys, monkeypatch):
+def test_interrupts(stage, part, out, capsys, monkeypatch):
     (out / "a.vtu").write_text("old")
     name, done = STAGES[stage]
 
     def interrupt(*args, **kwargs):
         if done:
             args[1].commit()
-        signal.raise_signal(number)
+        signal.raise_signal(signal.SIGINT)
         raise AssertionError("the signal was lost")
 
     monkeypatch.setattr(name, interrupt)
@@ -431,6 +301,35 @@ def test_interrupts(stage, number, part, out, capsys, monkeypatch):
         assert content(out) == {"a.vtu": b"old"}
         assert os.listdir(out) == ["a.vtu"]
         assert "nothing was written" in error
+
+
+PROGRAM = """
+import gc, signal, sys
+import jaxsmooth.report, jaxsmooth.io
+from jaxsmooth.cli import main
+
+def interrupt(*args):
+    gc.callbacks.remove(interrupt)
+    signal.raise_signal(signal.SIGTERM)  # an exception would be swallowed here
+
+def page(*args):
+    gc.callbacks.append(interrupt)
+    gc.collect()
+    return ""
+
+jaxsmooth.report.html_page = page
+sys.exit(main())
+"""
+
+
+def test_interrupts_that_callbacks_would_swallow(part, out):
+    (out / "a.vtu").write_text("old")
+    arguments = ("smooth", part, out / "a.vtu", "--steps", "0", "--report", out / "a.html")
+    program = [sys.executable, "-c", PROGRAM, *map(str, arguments)]
+    ended = subprocess.run(program, capture_output=True, text=True, cwd=Path(__file__).parents[1])
+    assert (ended.returncode, ended.stderr) == (130, "jaxsmooth: interrupted; nothing was written\n")
+    assert content(out) == {"a.vtu": b"old"}
+    assert os.listdir(out) == ["a.vtu"]
 
 
 @pytest.mark.parametrize(
