@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import json
 import math
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -163,8 +164,9 @@ def _set_up_jax(precision: str) -> None:
     jax.config.update("jax_enable_x64", precision == "float64")
     try:
         jax.default_backend()
-    except RuntimeError as error:  # JAX_PLATFORMS asks for what isn't there
-        raise ValueError(f"JAX finds no device to compute on ({error}); unset JAX_PLATFORMS") from error
+    except (RuntimeError, AssertionError) as error:
+        asked = os.environ.get("JAX_PLATFORMS", "")
+        raise ValueError(f"JAX finds no device for JAX_PLATFORMS={asked!r}; unset it, or say cpu") from error
 
 
 # --- Commands --------------------------------------------------------------------------

@@ -122,7 +122,7 @@ def write_to(
         with outputs.file(path) as part:
             notes = write_source(part, mesh, name, file.mesh.dim)
     except MeshFileError as error:
-        if isinstance(error.__cause__, OSError) and error.__cause__.errno is not None:  # a full disk, say
+        if isinstance(error.__cause__, OSError):  # not for the format to help: a full disk, say
             raise _unwritable(path, error.__cause__) from error
         raise MeshFileError(str(error).replace(str(part), str(path))) from error
     except OSError as error:
@@ -131,7 +131,8 @@ def write_to(
 
 
 def _unwritable(path: Any, error: OSError) -> MeshFileError:
-    return MeshFileError(f"{path}: the file can't be written ({error.strerror})")
+    reason = error.strerror or f"{error}: is the disk full?"  # NumPy's own has no more
+    return MeshFileError(f"{path}: the file can't be written ({reason.partition('(')[0].strip()})")
 
 
 def check_output(path: str | Path, input_path: str | Path | None = None, force: bool = False) -> None:
@@ -151,14 +152,14 @@ def check_output(path: str | Path, input_path: str | Path | None = None, force: 
     path = Path(path)
     if path.is_dir():
         raise MeshFileError(f"{path}: this is a folder; give the name of a file")
+    if path.exists():
+        _check_existing(path)
     target = Path(os.path.realpath(path))
     folder = target.parent if path.is_symlink() else path.parent
     if not folder.is_dir():
         raise MeshFileError(f"{path}: there is no folder {folder}; create it or write elsewhere")
     if target.is_symlink():
         raise MeshFileError(f"{path}: this link leads back to itself; give another name")
-    if target.exists():
-        _check_existing(path, target)
     if input_path is not None and not force and _same(path, Path(input_path)):
         raise MeshFileError(f"{path}: this is the input; give another name, or --force to replace it")
     try:  # permissions alone don't tell (read-only file systems, root)
@@ -167,13 +168,13 @@ def check_output(path: str | Path, input_path: str | Path | None = None, force: 
         raise MeshFileError(f"{path}: the folder {folder} can't be written ({error.strerror})") from error
 
 
-def _check_existing(path: Path, target: Path) -> None:
-    if not target.is_file():
+def _check_existing(path: Path) -> None:
+    if not path.is_file():
         raise MeshFileError(f"{path}: this is a device or a pipe; give the name of a file")
-    if not os.access(target, os.W_OK):  # a rename would not ask
+    if not os.access(path, os.W_OK):  # a rename would not ask
         raise MeshFileError(f"{path}: this file is read-only; give another name, or make it writable")
     try:
-        printed = os.path.samestat(os.fstat(1), target.stat())
+        printed = os.path.samestat(os.fstat(1), path.stat())
     except OSError:  # there is no standard output
         printed = False
     if printed:

@@ -117,10 +117,12 @@ def test_side_files_equal_to_others(part, out, no_work, capsys, monkeypatch):
 def test_files_that_are_no_files(part, out, no_work, capsys):
     os.mkfifo(out / "pipe.vtu")
     (out / "loop.vtu").symlink_to("loop.vtu")
+    reader, writer = os.pipe()
     for arguments, text in [
         ((out / "pipe.vtu",), "a device or a pipe"),
         ((out / "loop.vtu",), "leads back to itself"),
         ((out / "a.vtu", "--json", "/dev/null"), "a device or a pipe"),
+        ((out / "a.vtu", "--json", f"/dev/fd/{reader}"), "a device or a pipe"),
         ((out / "a.vtu", "--json", out), "this is a folder"),
         ((out / "a.vtu", "--json", ""), "this is a folder"),
         ((out / "a.vtu", "--report", "-"), "name a file"),
@@ -130,6 +132,15 @@ def test_files_that_are_no_files(part, out, no_work, capsys):
         assert run("smooth", part, *arguments) == 2, arguments
         one_sentence(capsys, text)
     assert sorted(os.listdir(out)) == ["loop.vtu", "pipe.vtu"]
+    os.close(reader)
+    os.close(writer)
+
+
+def test_a_platform_that_is_not_there(part, out, capsys, monkeypatch):
+    monkeypatch.setattr("jax.default_backend", raising(AssertionError()))  # what JAX 0.10 does
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    assert run("smooth", part, out / "a.vtu") == 2
+    one_sentence(capsys, "JAX_PLATFORMS='cuda'")
 
 
 def test_a_file_that_standard_output_goes_to(part, out, no_work, capfd):
