@@ -5,23 +5,27 @@ from __future__ import annotations
 import dataclasses
 import os
 import tempfile
-import uuid
+import unicodedata
 from collections.abc import Mapping
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 from jaxsmooth.files.exports import check_types, write_source
 from jaxsmooth.files.formats import MissingFileError, format_of_suffix, read_source, stem_format
 from jaxsmooth.meshfile import MeshFile, MeshFileError, from_meshio, to_meshio
+from jaxsmooth.outputs import Outputs
 
 __all__ = [
     "MeshFileError",
     "MissingFileError",
+    "check_distinct",
     "check_output",
     "check_types",
     "output_format",
     "read",
     "write",
+    "write_to",
 ]
 
 
@@ -62,7 +66,8 @@ def write(
 ) -> tuple[str, ...]:
     """Write a file that was read, with other coordinates.
 
-    The output is complete or not there: it is written beside its target and renamed.
+    The output is complete or not there: it is written beside its target and renamed.  A link is written
+    through to its target; a file that is replaced gives its mode to the new one.
 
     Args:
         path: where to.  A name of the input's format keeps its version; others choose the format.
@@ -82,25 +87,52 @@ def write(
         MeshFileError: the output is the input (without `force`), its folder is missing or can't be
             written, or the format can't hold the mesh.
     """
+    options = {"file_format": file_format, "cell_data": cell_data, "point_data": point_data}
+    with Outputs() as outputs:
+        notes = write_to(outputs, path, file, points, force=force, **options)
+        try:
+            outputs.commit()
+        except OSError as error:
+            raise _unwritable(error.filename, error) from error
+    return notes
+
+
+def write_to(
+    outputs: Outputs,
+    path: str | Path,
+    file: MeshFile,
+    points: Any = None,
+    *,
+    file_format: str | None = None,
+    force: bool = False,
+    cell_data: Mapping[str, Any] | None = None,
+    point_data: Mapping[str, Any] | None = None,
+) -> tuple[str, ...]:
+    """`write` as one of several outputs: the file is put in place when they are committed."""
     path = Path(path)
     check_output(path, file.path, force)
+    if file.path is not None:
+        outputs.protect(file.path)
     name = output_format(path, file, file_format)
     check_types(file.mesh.types, path, name)
     for attribute in ("mesh", "points"):
         points = getattr(points, attribute, points)
     mesh = to_meshio(file, points, point_data=point_data, cell_data=cell_data)
-    # the suffix stays: some writers go by it
-    part = path.with_name(f".{path.stem}-{uuid.uuid4().hex[:8]}{''.join(path.suffixes[-1:])}")
     try:
-        notes = write_source(part, mesh, name, file.mesh.dim)
-        os.replace(part, path)
+        with outputs.file(path) as part:
+            notes = write_source(part, mesh, name, file.mesh.dim)
     except MeshFileError as error:
+        if isinstance(error.__cause__, OSError):  # not for the format to help: a full disk, say
+            raise _unwritable(path, error.__cause__) from error
         raise MeshFileError(str(error).replace(str(part), str(path))) from error
     except OSError as error:
-        raise MeshFileError(f"{path}: the file can't be written ({error.strerror})") from error
-    finally:
-        part.unlink(missing_ok=True)
+        raise _unwritable(path, error) from error
     return tuple(notes)
+
+
+def _unwritable(path: Any, error: OSError) -> MeshFileError:
+    reason = error.strerror or f"{error}: is the disk full?"  # NumPy's own has no more
+    return MeshFileError(f"{path}: the file can't be written ({reason.partition('(')[0].strip()})")
 
 
 def check_output(path: str | Path, input_path: str | Path | None = None, force: bool = False) -> None:
@@ -114,14 +146,20 @@ def check_output(path: str | Path, input_path: str | Path | None = None, force: 
         force: allow the two to be one file.
 
     Raises:
-        MeshFileError: no such folder, a folder that can't be written, or the input without `force`.
+        MeshFileError: no such folder, a folder or a file that can't be written, no regular file, or the
+            input without `force`.
     """
     path = Path(path)
-    folder = path.parent
-    if not folder.is_dir():
-        raise MeshFileError(f"{path}: there is no folder {folder}; create it or write elsewhere")
     if path.is_dir():
         raise MeshFileError(f"{path}: this is a folder; give the name of a file")
+    if path.exists():
+        _check_existing(path)
+    target = Path(os.path.realpath(path))
+    folder = target.parent if path.is_symlink() else path.parent
+    if not folder.is_dir():
+        raise MeshFileError(f"{path}: there is no folder {folder}; create it or write elsewhere")
+    if target.is_symlink():
+        raise MeshFileError(f"{path}: this link leads back to itself; give another name")
     if input_path is not None and not force and _same(path, Path(input_path)):
         raise MeshFileError(f"{path}: this is the input; give another name, or --force to replace it")
     try:  # permissions alone don't tell (read-only file systems, root)
@@ -130,11 +168,45 @@ def check_output(path: str | Path, input_path: str | Path | None = None, force: 
         raise MeshFileError(f"{path}: the folder {folder} can't be written ({error.strerror})") from error
 
 
+def _check_existing(path: Path) -> None:
+    if not path.is_file():
+        raise MeshFileError(f"{path}: this is a device or a pipe; give the name of a file")
+    if not os.access(path, os.W_OK):  # a rename would not ask
+        raise MeshFileError(f"{path}: this file is read-only; give another name, or make it writable")
+    try:
+        printed = os.path.samestat(os.fstat(1), path.stat())
+    except OSError:  # there is no standard output
+        printed = False
+    if printed:
+        raise MeshFileError(f"{path}: standard output goes to this file; give another name")
+
+
+def check_distinct(files: Mapping[str, str | Path]) -> None:
+    """Whether files that one run reads or writes are different ones.
+
+    Args:
+        files: their paths, by what they are for (``"--json"``).
+
+    Raises:
+        MeshFileError: two of them are one file (by a link, or by names that differ in case only).
+    """
+    for (first, path), (second, other) in combinations(files.items(), 2):
+        if _same(Path(path), Path(other)):
+            raise MeshFileError(f"{other}: {second} and {first} are one file; give another name")
+
+
 def _same(path: Path, other: Path) -> bool:
     try:
         return path.samefile(other)
     except OSError:  # one of them isn't there
-        return path.resolve() == other.resolve()
+        if path.exists() or other.exists():
+            return False
+    return _folded(path) == _folded(other)
+
+
+def _folded(path: Path) -> str:
+    """For files to be: some systems take names that differ in case, or in how accents are stored, as one."""
+    return unicodedata.normalize("NFC", os.path.realpath(path)).casefold()
 
 
 def output_format(path: str | Path, file: MeshFile, file_format: str | None = None) -> str:

@@ -52,7 +52,7 @@ def before_after(before: Mesh, after: Mesh, title: str = "", view: tuple[float, 
             color=_INK,
         )
     histogram(axes[2], before, after)
-    figure.suptitle(title, color=_INK)
+    figure.suptitle(title, color=_INK, parse_math=False)  # names of files may have a $
     return figure
 
 

@@ -7,7 +7,7 @@ import html
 import io
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -22,6 +22,7 @@ from jaxsmooth.constraints import Constraints
 from jaxsmooth.mesh import Mesh
 from jaxsmooth.meshfile import MeshFile
 from jaxsmooth.metrics import METRICS, quality
+from jaxsmooth.outputs import Outputs
 from jaxsmooth.smoothing import SmoothResult, StepRecord
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "compare_row",
     "console",
     "counts",
+    "html_page",
     "movable_elements",
     "print_compare",
     "print_comparison",
@@ -49,8 +51,11 @@ class Clock:
     def __call__(self, phase: str) -> Iterator[None]:
         start, compiled = time.perf_counter(), _compile_seconds()
         yield
-        self.seconds[phase] = time.perf_counter() - start
-        self._compiled[phase] = _compile_seconds() - compiled
+        for total, spent in (
+            (self.seconds, time.perf_counter() - start),
+            (self._compiled, _compile_seconds() - compiled),
+        ):
+            total[phase] = total.get(phase, 0.0) + spent
 
     def split(self) -> dict[str, float]:
         """The phases with compilation taken out of them and shown as a phase of its own."""
@@ -115,8 +120,15 @@ def counts(mesh: Mesh) -> dict[str, Any]:
     return {"nodes": len(mesh.points), "elements": sizes}
 
 
-def as_json(source: str, output: str, method: str, result: SmoothResult, seconds: dict) -> dict[str, Any]:
-    """The documented JSON of ``smooth``."""
+def as_json(
+    source: str,
+    output: str,
+    method: str,
+    result: SmoothResult,
+    seconds: dict,
+    notes: Sequence[str] = (),
+) -> dict[str, Any]:
+    """The documented JSON of ``smooth``; `notes` are those of the reader and of the writer."""
     return _finite(
         {
             "input": str(source),
@@ -128,6 +140,7 @@ def as_json(source: str, output: str, method: str, result: SmoothResult, seconds
             "status": str(result.status),
             "steps": [row.as_json() for row in result.history],
             "seconds": seconds,
+            "notes": list(notes),
         }
     )
 
@@ -193,9 +206,15 @@ def compare_row(
 # --- Console ---------------------------------------------------------------------------
 
 
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        """Whoever reads has read enough (``| head``); the work goes on."""
+        self.quiet = True
+
+
 def console(quiet: bool = False) -> Console:
-    """Where people read: standard output; silent when `quiet`."""
-    out = Console(quiet=quiet, highlight=False, soft_wrap=True)
+    """Where people read: standard output; silent when `quiet`.  Names of files are printed as they are."""
+    out = _Console(quiet=quiet, highlight=False, soft_wrap=True, markup=False, emoji=False)
     if not out.is_terminal:
         out.width = 160
     return out
@@ -212,7 +231,7 @@ def print_file(out: Console, file: MeshFile) -> None:
 def print_notes(out: Console, notes: tuple[str, ...]) -> None:
     """What the reader or the writer noticed."""
     for note in notes:
-        out.print(f"  note: {note}", style="yellow", markup=False)
+        out.print(f"  note: {note}", style="yellow")
 
 
 def print_constraints(out: Console, constraints: Constraints) -> None:
@@ -304,9 +323,17 @@ def print_compare(out: Console, rows: list[dict[str, Any]]) -> None:
 
 
 def write_html(path: str | Path, title: str, before: Mesh, result: SmoothResult) -> None:
-    """A report in one file: picture, before/after table, history.  Needs the `viz` extra."""
+    """Write `html_page` to a file, complete or not at all."""
+    with Outputs() as outputs:
+        outputs.text(path, html_page(title, before, result))
+        outputs.commit()
+
+
+def html_page(title: str, before: Mesh, result: SmoothResult) -> str:
+    """A report in one page: picture, before/after table, history.  Needs the `viz` extra."""
     from jaxsmooth.pictures import before_after
 
+    title = title.encode("utf-8", "replace").decode()  # names of files may be any bytes
     buffer = io.BytesIO()
     before_after(before, result.mesh, title).savefig(buffer, format="png", dpi=130)
     picture = base64.b64encode(buffer.getvalue()).decode()
@@ -320,18 +347,15 @@ def write_html(path: str | Path, title: str, before: Mesh, result: SmoothResult)
         numbers = [f"{s[key]:.4f}" for key in ("q_min", "q_avg", "q_max", "q_std")]
         tail = (s["below"], s["inverted"], row.solver_iterations, f"{row.seconds:.2f}")
         steps.append((row.step, *numbers, *tail))
-    page = f"""<!doctype html><meta charset="utf-8"><title>{html.escape(title)}</title>
+    title = html.escape(title)
+    return f"""<!doctype html><meta charset="utf-8"><title>{title}</title>
 <style>body{{font:15px/1.5 system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem}}
 td,th{{padding:.15rem .8rem;text-align:right}}td:first-child,th:first-child{{text-align:left}}
 tr:nth-child(even){{background:#f4f4f4}}img{{max-width:100%}}</style>
-<h1>{html.escape(title)}</h1><p>{html.escape(str(result.status))}; {len(result.mesh.points):,} nodes.</p>
+<h1>{title}</h1><p>{html.escape(str(result.status))}; {len(result.mesh.points):,} nodes.</p>
 <img alt="before and after" src="data:image/png;base64,{picture}">{table}
 <h2>Steps</h2>{_html_table(heads, steps)}
 """
-    target = Path(path)
-    temporary = target.with_name(f".{target.name}.{time.monotonic_ns()}")
-    temporary.write_text(page, encoding="utf-8")
-    temporary.replace(target)
 
 
 def _html_table(heads: tuple[str, ...], rows: list[tuple]) -> str:

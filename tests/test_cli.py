@@ -113,8 +113,69 @@ def test_inverted_elements_give_exit_code_3(tmp_path, capsys):
         tmp_path / "in.vtk"
     )
     assert run("quality", tmp_path / "in.vtk") == 3
+    capsys.readouterr()
     assert run("smooth", tmp_path / "in.vtk", tmp_path / "out.vtk", "--steps", 0) == 3
+    assert "inverted elements remain; wrote" in capsys.readouterr().out
+    assert run("smooth", tmp_path / "in.vtk", tmp_path / "out.vtk", "--steps", 0, "-q") == 3
+    assert "inverted elements remain" in capsys.readouterr().err
     assert (tmp_path / "out.vtk").exists()
+
+
+def history(part, out, *options):
+    numbers = out.with_suffix(".json")
+    assert run("smooth", part, out, "-q", "--json", numbers, "--method", "laplacian", *options) == 0
+    return json.loads(numbers.read_text())["steps"]
+
+
+def test_steps_are_exact(part, tmp_path):
+    steps = len(history(part, tmp_path / "a.vtu")) - 1
+    assert 2 < steps < 9  # it converges
+    rows = history(part, tmp_path / "b.vtu", "--steps", 9)
+    assert len(rows) - 1 == 9
+    assert rows[9]["q_avg"] != rows[8]["q_avg"]
+    assert len(history(part, tmp_path / "c.vtu", "--steps", 0)) == 1
+
+
+class Enough(Exception):
+    """Ends a run when the test has seen what it wants."""
+
+
+def arguments_of(monkeypatch, name, *command):
+    """What a function of the library is called with; it does nothing."""
+    seen = []
+
+    def record(*args, **kwargs):
+        seen.append((args, kwargs))
+        raise Enough
+
+    with monkeypatch.context() as patch:
+        patch.setattr(name, record)
+        with pytest.raises(Enough):
+            run(*command)
+    return seen[0]
+
+
+def test_the_goal_reaches_the_method(part, tmp_path, monkeypatch):
+    smooth = ("smooth", part, tmp_path / "out.vtu", "--method", "optimize")
+    for command, goal in [
+        ((*smooth, "--goal", "worst"), "worst"),
+        ((*smooth, "--goal", "average"), "average"),
+        (smooth, "balanced"),
+        (("compare", part, "--methods", "optimize, elastic", "--goal", "worst"), "worst"),
+    ]:
+        (_, method), _ = arguments_of(monkeypatch, "jaxsmooth.smoothing.smooth", *command)
+        assert method == js.Optimize(goal=goal)
+    with pytest.raises(SystemExit) as end:
+        run(*smooth, "--goal", "best")
+    assert end.value.code == 2
+
+
+def test_freezing_reaches_the_constraints(part, tmp_path, monkeypatch):
+    detect = "jaxsmooth.constraints.detect_constraints"
+    smooth = ("smooth", part, tmp_path / "out.vtu")
+    assert "freeze_aspect" not in arguments_of(monkeypatch, detect, *smooth)[1]
+    for command in (smooth, ("compare", part)):
+        assert arguments_of(monkeypatch, detect, *command, "--freeze-aspect", 20)[1]["freeze_aspect"] == 20
 
 
 BAD = [
@@ -127,6 +188,11 @@ BAD = [
     (("smooth", "PART", "OUT", "--fix", "fixed"), "unknown set 'fixed'"),
     (("smooth", "PART", "OUT", "--steps", "-1"), "steps"),
     (("smooth", "PART", "OUT", "--json", "nofolder/x.json"), "nofolder"),
+    (("smooth", "PART", "OUT", "--goal", "worst"), "--goal is for the method optimize, not for elastic"),
+    (("compare", "PART", "--methods", "elastic", "--goal", "worst"), "add it to --methods"),
+    (("smooth", "PART", "OUT", "--freeze-aspect", "1"), "above 1"),
+    (("compare", "PART", "--freeze-aspect", "nan"), "above 1"),
+    (("smooth", "PART", "OUT", "--feature-angle", "nan"), "--feature-angle"),
     (("quality", "PART", "--metric", "mean_ration"), "did you mean mean_ratio"),
     (("compare", "PART", "--methods", "elastic,laplaciun"), "did you mean laplacian"),
 ]
@@ -183,6 +249,20 @@ def test_the_help_names_every_method():
     from jaxsmooth.methods import METHODS
 
     assert _METHODS.split(", ") == list(METHODS)
+
+
+def test_the_help_says_the_defaults():
+    from jaxsmooth.cli import _GOALS, _parser
+    from jaxsmooth.methods.optimize import GOALS
+
+    assert list(GOALS) == list(_GOALS)
+    (commands,) = (a.choices for a in _parser()._actions if a.choices)
+    for command in commands.values():
+        options = [a for a in command._actions if (a.option_strings or a.nargs) and a.dest != "help"]
+        assert [a.dest for a in options if "(default: " not in (a.help or "")] == []
+        for action in options:
+            if isinstance(action.default, str):
+                assert f"(default: {action.default})" in action.help
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "jaxsmooth"
 ORDER = [
-    ("acceptance", "quadrature"),
+    ("acceptance", "outputs", "quadrature", "terminal"),
     ("elements",),
     ("mesh", "small", "rounding"),
     ("topology",),

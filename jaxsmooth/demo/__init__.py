@@ -1,36 +1,53 @@
 """The mesh that ships with the package, a bracket of tetrahedra with slivers, and its demo."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jaxsmooth.outputs import Outputs
 
 __all__ = ["MESH", "run"]
 
 MESH = Path(__file__).with_name("bracket.vtu")
+_TITLE = "jaxsmooth demo"
 
 
-def run(directory: Path) -> int:
-    """Smooth the demo mesh; write the result, a picture and a report to `directory`.
+def run(directory: Path, outputs: Outputs) -> None:
+    """Smooth the demo mesh; write the result to `directory`, with matplotlib also a picture and a report.
 
-    Returns the exit code of the command line.
+    The files are committed to `outputs`; without matplotlib a line says what is missing.
     """
     from jaxsmooth import report
-    from jaxsmooth.io import read, write
+    from jaxsmooth.io import check_output, read, write_to
     from jaxsmooth.meshfile import as_mesh
     from jaxsmooth.methods import Elastic
-    from jaxsmooth.pictures import before_after
     from jaxsmooth.smoothing import smooth
 
-    directory.mkdir(parents=True, exist_ok=True)
     out = report.console()
+    names = ["bracket-smooth.vtu"]
+    try:
+        from jaxsmooth.pictures import before_after
+    except ImportError as missing:
+        out.print(f"neither picture nor report: {missing}", style="yellow")
+    else:
+        names += ["before-after.png", "report.html"]
+    outputs.folder(directory)
+    mesh_path, *picture_paths = paths = [directory / name for name in names]
+    for path in paths:
+        check_output(path)
     file = read(MESH)
     report.print_file(out, file)
     result = smooth(file, Elastic(extended=True), callback=lambda row: report.print_step(out, row))
     report.print_constraints(out, result.constraints)
-    write(directory / "bracket-smooth.vtu", file, result, force=True, cell_data={"quality": result.quality})
+    write_to(outputs, mesh_path, file, result, cell_data={"quality": result.quality})
     before = as_mesh(file)
-    before_after(before, result.mesh, "jaxsmooth demo: a bracket, elastic-extended").savefig(
-        directory / "before-after.png", dpi=130
-    )
-    report.write_html(directory / "report.html", "jaxsmooth demo", before, result)
+    if picture_paths:
+        figure = before_after(before, result.mesh, f"{_TITLE}: a bracket, elastic-extended")
+        with outputs.file(picture_paths[0]) as part:
+            figure.savefig(part, dpi=130)
+        outputs.text(picture_paths[1], report.html_page(_TITLE, before, result))
     report.print_comparison(out, before, result)
-    out.print(f"{result.status}; wrote bracket-smooth.vtu, before-after.png and report.html to {directory}/")
-    return 0
+    outputs.commit()
+    out.print(f"{result.status}; wrote {', '.join(names)} to {directory}/")
