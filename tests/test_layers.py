@@ -7,11 +7,11 @@ PACKAGE = Path(__file__).parents[1] / "jaxsmooth"
 ORDER = [
     ("quadrature",),
     ("elements",),
-    ("mesh", "small"),
+    ("mesh", "small", "bernstein"),
     ("topology",),
     ("orientation", "files.checks", "files.labels"),
     ("meshfile",),
-    ("metrics", "constraints", "fitting", "elasticity"),
+    ("metrics", "validity", "constraints", "fitting", "elasticity"),
     ("patches", "solve", "distortion"),
     ("objective", "minimise"),
     ("methods",),
