@@ -49,11 +49,14 @@ def determinant_bound(kind: ElementType, nodes: Float[Array, "k dim"]) -> Float[
     return coefficients.min() - noise * _scale(table, nodes)
 
 
+_product = partial(jnp.matmul, precision="highest")  # some devices round the factors otherwise
+
+
 def _at_once(table: Bernstein, nodes: Float[Array, "k dim"]) -> Float[Array, "..."]:
     """Coefficients whose least is the bound.  Sums fuse, see `small.contract`."""
     rows = [jnp.asarray(rows, nodes.dtype) for rows in table.tangents]
     tangents = [(nodes * row[..., None]).sum(axis=-2) for row in rows]
-    return jnp.asarray(table.bounding, nodes.dtype) @ _volumes(tangents).reshape(-1)
+    return _product(jnp.asarray(table.bounding, nodes.dtype), _volumes(tangents).reshape(-1))
 
 
 def _in_layers(table: Bernstein, nodes: Float[Array, "k dim"]) -> Float[Array, "..."]:
@@ -61,11 +64,11 @@ def _in_layers(table: Bernstein, nodes: Float[Array, "k dim"]) -> Float[Array, "
     first, other = (jnp.asarray(matrix, nodes.dtype) for matrix in table.layer_matrices)
 
     def layer(rows: Float[Array, "k columns"]) -> Float[Array, " _"]:
-        tangents = (nodes.T @ rows).reshape(table.kind.dim, table.kind.dim, -1)
+        tangents = _product(nodes.T, rows).reshape(table.kind.dim, table.kind.dim, -1)
         return _volumes(list(jnp.moveaxis(tangents, 0, -1)))
 
     samples = jax.lax.map(layer, jnp.asarray(table.layers, nodes.dtype))
-    return (first @ samples) @ other.T
+    return _product(_product(first, samples), other.T)
 
 
 def _scale(table: Bernstein, nodes: Float[Array, "k dim"]) -> Float[Array, ""]:

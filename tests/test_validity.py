@@ -152,6 +152,16 @@ def test_degenerate_elements_are_inverted(kind):
     assert (bounds(kind, nodes.astype(np.float32)) <= 0).all()
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_thin_elements_are_valid(kind):
+    """Layers and needles of aspect 10⁵, askew in space."""
+    dim = dim_of(kind)
+    thin = [np.where(np.arange(dim) < axes, 1, 1e-5) for axes in range(1, dim)]
+    nodes = np.array([ideal(kind) * scale @ rotation_matrix(dim).T for scale in thin])
+    assert not verdict(kind, nodes).any()
+    assert (bounds(kind, nodes) > 0).all()
+
+
 def test_nan_is_inverted():
     mesh = mesh_of("tetra10", np.stack([ideal("tetra10")] * 2))
     assert inverted(mesh.with_points(mesh.points.at[3].set(jnp.nan)))[0].tolist() == [True, False]
