@@ -67,20 +67,17 @@ def smooth_file(path: Path, name: str, steps: int, boundary: str) -> str:
     from jaxsmooth.constraints import detect_constraints
     from jaxsmooth.io import read, write
     from jaxsmooth.methods import METHODS
-    from jaxsmooth.metrics import quality
     from jaxsmooth.report import movable_elements, summarise
     from jaxsmooth.smoothing import smooth
+    from jaxsmooth.validity import inverted
 
     file = read(path)
     start = time.perf_counter()
-    constraints = detect_constraints(file.mesh, fixed=file.fixed, boundary=boundary)
+    constraints = detect_constraints(file.mesh, boundary=boundary)
     result = smooth(file, METHODS[name](), steps=steps, constraints=constraints, tolerance_avg=0.0)
     seconds = time.perf_counter() - start
     warm = [row.seconds for row in result.history[2:]]
-    before, after = (
-        np.concatenate([np.asarray(part) > 0 for part in quality(mesh, "min_jacobian")])
-        for mesh in (file.mesh, result.mesh)
-    )
+    before, after = (np.concatenate([~part for part in inverted(mesh)]) for mesh in (file.mesh, result.mesh))
     if name not in ("laplacian", "weighted-laplacian") and (before & ~after).any():
         raise ValueError(f"{int((before & ~after).sum())} elements inverted that were not")
     with tempfile.TemporaryDirectory() as folder:

@@ -14,8 +14,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsmooth.elements import ElementType
 from jaxsmooth.mesh import Mesh, gather
-from jaxsmooth.metrics import measure, min_jacobian, scaled_jacobian, shape_quality
+from jaxsmooth.metrics import measure, scaled_jacobian, shape_quality
 from jaxsmooth.small import unit_scale
+from jaxsmooth.validity import determinant_bound
 
 __all__ = ["Evaluation", "Guarded", "PatchGuard", "evaluate", "patch_mean", "patch_min"]
 
@@ -30,8 +31,8 @@ class Evaluation(NamedTuple):
 
     Attributes:
         quality: the paper's q (Eqs. 1–5).
-        jacobian: least Jacobian determinant, of the mesh scaled to about unit size: positive where
-            the element is valid.
+        jacobian: a bound of the Jacobian determinant, of the mesh scaled to about unit size: where it
+            is positive the element is valid everywhere; else it is inverted, or not proven valid.
         corners: scaled Jacobian, which sees single corners, as q does not.
     """
 
@@ -46,7 +47,7 @@ def evaluate(mesh: Mesh, beta: Float[Array, ""] | float = 2.0) -> Evaluation:
 
     def element(kind: ElementType, nodes: Float[Array, "k dim"]) -> tuple[Array, Array, Array]:
         q = shape_quality(kind, nodes, beta)
-        return q, min_jacobian(kind, nodes), scaled_jacobian(kind, nodes)
+        return q, determinant_bound(kind, nodes), scaled_jacobian(kind, nodes)
 
     found = [_map_elements(partial(element, kind), points, nodes) for kind, nodes in mesh.blocks]
     return Evaluation(*zip(*found, strict=True))
@@ -95,15 +96,14 @@ class _Needs(NamedTuple):
     """What an element must keep after the move, block by block.
 
     Attributes:
-        node: quality, for each of its nodes ``[elements, k]``; who moves answers for the patch.
-        element: quality, corners ``[elements]``: all nodes of the element answer.
-        valid: elements whose determinant must stay positive.
+        node: quality, for each of its nodes ``[elements, k]``: who moves answers for the patch.
+        quality, jacobian, corners: of the element; all its nodes answer.
     """
 
     node: tuple[Float[Array, "elements k"], ...]
     quality: Blocks
+    jacobian: Blocks
     corners: Blocks
-    valid: tuple[Bool[Array, " elements"], ...]
 
 
 class PatchGuard(eqx.Module):
@@ -175,12 +175,14 @@ class PatchGuard(eqx.Module):
         needs = []
         for (_, nodes), q, det, corner in zip(mesh.blocks, *start, strict=True):
             around = jnp.where(det > 0, gather(corner_patch, nodes).max(axis=1), corner_least)
+            # valid elements stay valid; those that are not proven, but open at all corners, as good
+            proven = jnp.where(det > 0, 0, jnp.where(corner > 0, (1 + slack) * det, -jnp.inf))
             needs.append(
                 (
                     gather(node, nodes) - slack,
                     jnp.where(q >= floor, floor, least) - slack,
+                    proven,
                     jnp.where(corner >= corner_floor, corner_floor, around) - slack,
-                    det > 0,
                 )
             )
         return _Needs(*zip(*needs, strict=True))
@@ -200,11 +202,11 @@ def _offenders(
 ) -> Bool[Array, " nodes"]:
     """Nodes whose patch offends; of an element that offends a node that is still, all nodes."""
     bad = jnp.zeros(len(mesh.points), bool)
-    for (_, nodes), need, q_need, c_need, valid, q, det, corner in zip(
+    for (_, nodes), need, q_need, det_need, corner_need, q, det, corner in zip(
         mesh.blocks, *needs, *after, strict=True
     ):
         own = ~(q[:, None] >= need)  # so written, NaN offends
-        whole = ~(q >= q_need) | ~(corner >= c_need) | (valid & ~(det > 0))
+        whole = ~(q >= q_need) | ~(det > det_need) | ~(corner >= corner_need)
         whole |= (own & gather(still, nodes)).any(axis=1)
         bad = bad.at[nodes].max(own | whole[:, None], mode="promise_in_bounds")
     return bad

@@ -18,12 +18,14 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from jaxsmooth.acceptance import POOR
 from jaxsmooth.constraints import Constraints
 from jaxsmooth.mesh import Mesh
 from jaxsmooth.meshfile import MeshFile
 from jaxsmooth.metrics import METRICS, quality
 from jaxsmooth.outputs import Outputs
 from jaxsmooth.smoothing import SmoothResult, StepRecord
+from jaxsmooth.validity import inverted
 
 __all__ = [
     "Clock",
@@ -99,7 +101,9 @@ def _values(mesh: Mesh, name: str, masks: tuple[np.ndarray, ...] | None = None) 
 
 def summarise(mesh: Mesh, masks: tuple[np.ndarray, ...] | None = None) -> dict[str, float]:
     """The statistics of the final table, over all or over chosen elements."""
-    q, det = _values(mesh, "shape", masks), _values(mesh, "min_jacobian", masks)
+    q, tangled = _values(mesh, "shape", masks), inverted(mesh)
+    if masks is not None:
+        tangled = tuple(part[mask] for part, mask in zip(tangled, masks, strict=True))
     scaled = _values(mesh, "scaled_jacobian", masks)
     if len(q) == 0:
         return {}
@@ -108,8 +112,8 @@ def summarise(mesh: Mesh, masks: tuple[np.ndarray, ...] | None = None) -> dict[s
         "q_avg": q.mean(),
         "q_max": q.max(),
         "q_std": q.std(ddof=1) if len(q) > 1 else 0.0,
-        "q_below_0.2": int((q < 0.2).sum()),
-        "inverted": int((~(det > 0)).sum()),
+        "q_below_0.2": int((q < POOR).sum()),
+        "inverted": sum(int(part.sum()) for part in tangled),
         "scaled_jacobian_min": scaled.min(),
     }
 
@@ -178,9 +182,9 @@ def quality_rows(mesh: Mesh, names: list[str]) -> list[dict[str, Any]]:
                     }
                 )
             )
-    det = _values(mesh, "min_jacobian")
+    tangled = sum(int(part.sum()) for part in inverted(mesh))
     for entry in rows:
-        entry["inverted"] = int((~(det > 0)).sum())
+        entry["inverted"] = tangled
     return rows
 
 

@@ -20,6 +20,7 @@ from jaxsmooth.meshfile import as_mesh
 from jaxsmooth.methods import Elastic, Method
 from jaxsmooth.patches import Evaluation, evaluate
 from jaxsmooth.runs import run
+from jaxsmooth.validity import inverted
 
 __all__ = ["SmoothResult", "Statistics", "Status", "StepRecord", "smooth", "statistics"]
 
@@ -68,20 +69,20 @@ class SmoothResult:
 
 @partial(jax.jit, static_argnames=("threshold",))
 def _summary(evaluation: Evaluation, threshold: float) -> tuple[Array, ...]:
-    q, det = jnp.concatenate(evaluation.quality), jnp.concatenate(evaluation.jacobian)
+    q = jnp.concatenate(evaluation.quality)
     deviation = jnp.std(q, ddof=1) if q.size > 1 else jnp.zeros((), q.dtype)
     worst = jnp.stack([part.min() for part in evaluation.corners]).min()
-    # ~(det > 0) counts NaN as inverted
-    return q.min(), q.max(), q.mean(), deviation, (q < threshold).sum(), (~(det > 0)).sum(), worst
+    return q.min(), q.max(), q.mean(), deviation, worst, (q < threshold).sum()
 
 
 def statistics(mesh: Any, evaluation: Evaluation | None = None, threshold: float = POOR) -> Statistics:
     """Statistics of a mesh; an `evaluation` that is already known saves time."""
     mesh = as_mesh(mesh)
     evaluation = _evaluate(_bare(mesh)) if evaluation is None else evaluation
-    values = _summary(evaluation, threshold)
-    q_min, q_max, q_avg, q_std, below, inverted, worst = (v.item() for v in jax.device_get(values))
-    return Statistics(q_min, q_max, q_avg, q_std, below, inverted, worst)
+    *values, below = (value.item() for value in jax.device_get(_summary(evaluation, threshold)))
+    tangled = sum(int(part.sum()) for part in inverted(mesh, evaluation.jacobian))
+    q_min, q_max, q_avg, q_std, worst = values
+    return Statistics(q_min, q_max, q_avg, q_std, below, tangled, worst)
 
 
 @jax.jit

@@ -16,7 +16,6 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsmooth.bernstein import Bernstein, bernstein
 from jaxsmooth.elements import ElementType
 from jaxsmooth.mesh import Mesh, gather
-from jaxsmooth.metrics import min_jacobian
 
 __all__ = ["determinant_bound", "inverted"]
 
@@ -104,31 +103,33 @@ def _volumes(tangents: Sequence[Array]) -> Array:
 
 
 @partial(jax.jit, static_argnames=("kind",))
-def _first_look(kind: ElementType, points: Array, nodes: Array) -> tuple[Array, Array]:
-    corners = gather(points, nodes)
-    proven = jax.vmap(partial(determinant_bound, kind))(corners) > 0
-    refuted = ~(jax.vmap(partial(min_jacobian, kind))(corners) > 0)  # NaN is refuted
-    return proven, refuted
+def _bounds(kind: ElementType, points: Array, nodes: Array) -> Array:
+    return jax.vmap(partial(determinant_bound, kind))(gather(points, nodes))
 
 
-def inverted(mesh: Mesh) -> tuple[Bool[np.ndarray, " elements"], ...]:
+def inverted(
+    mesh: Mesh, bounds: Sequence[Float[Array, " elements"]] | None = None
+) -> tuple[Bool[np.ndarray, " elements"], ...]:
     """Which elements are not valid: their Jacobian determinant is not positive somewhere inside.
 
-    Bounds and samples decide nearly all; the others are halved until one of them does.  An element
-    whose determinant touches zero, to rounding, counts as inverted; so does one with a coordinate
-    that is not finite.  For use on the host.
+    The bounds decide nearly all; the others are halved until one of their parts is refuted or all are
+    proven.  An element whose determinant touches zero, to rounding, counts as inverted; so does one with
+    a coordinate that is not finite.  For use on the host.
 
     Args:
         mesh: the mesh.
+        bounds: `determinant_bound` of its elements, where it is known, times any positive number.
 
     Returns:
         One mask ``[elements]`` for every block.
     """
     points = np.asarray(mesh.points, np.float64)
+    if bounds is None:
+        bounds = [_bounds(kind, mesh.points, nodes) for kind, nodes in mesh.blocks]
     found = []
-    for kind, nodes in mesh.blocks:
-        proven, refuted = map(np.array, _first_look(kind, mesh.points, nodes))
-        open_ = np.flatnonzero(~proven & ~refuted)
+    for (kind, nodes), bound in zip(mesh.blocks, bounds, strict=True):
+        refuted = ~(np.asarray(bound) > 0)  # NaN is refuted below
+        open_ = np.flatnonzero(refuted)
         refuted[open_] = _refute(kind, points[np.asarray(nodes)[open_]])
         found.append(refuted)
     return tuple(found)
