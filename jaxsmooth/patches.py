@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsmooth.elements import ElementType
 from jaxsmooth.mesh import Mesh, gather
 from jaxsmooth.metrics import measure, scaled_jacobian, shape_quality
-from jaxsmooth.small import unit_scale
+from jaxsmooth.small import canonical
 from jaxsmooth.validity import determinant_bound
 
 __all__ = ["Evaluation", "Guarded", "PatchGuard", "evaluate", "patch_mean", "patch_min"]
@@ -43,7 +43,7 @@ class Evaluation(NamedTuple):
 
 def evaluate(mesh: Mesh, beta: Float[Array, ""] | float = 2.0) -> Evaluation:
     """Quality, validity and corners of all elements."""
-    points = mesh.points * unit_scale(mesh.points)
+    points, _ = canonical(mesh.points)
 
     def element(kind: ElementType, nodes: Float[Array, "k dim"]) -> tuple[Array, Array, Array]:
         q = shape_quality(kind, nodes, beta)
@@ -214,13 +214,13 @@ def _offenders(
 
 def _extra_halvings(mesh: Mesh, move: Field) -> Int[Array, " nodes"]:
     """Halvings that make a move as short as the least element around its node is large."""
-    points = mesh.points * unit_scale(mesh.points)
+    points, unit = canonical(mesh.points)
     sizes = [
         _map_elements(lambda x, kind=kind: (jnp.abs(measure(kind, x)) ** (1 / kind.dim),), points, nodes)[0]
         for kind, nodes in mesh.blocks
     ]
     local = patch_min(mesh, tuple(sizes))
-    length = jnp.abs(move).max(axis=-1) * unit_scale(mesh.points)
+    length = jnp.abs(move).max(axis=-1) * unit
     ratio = jnp.where(jnp.isfinite(length) & (local > 0), length / jnp.where(local > 0, local, 1), 1)
     return jnp.ceil(jnp.log2(jnp.clip(ratio, 1, _LONGEST))).astype(jnp.int32)
 

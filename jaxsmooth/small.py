@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 __all__ = [
+    "canonical",
     "cofactors",
     "contract",
     "determinant",
@@ -14,7 +15,6 @@ __all__ = [
     "norm",
     "power",
     "solve_regular",
-    "unit_scale",
 ]
 
 
@@ -80,11 +80,13 @@ def solve_regular(a: Float[Array, "dim dim"], b: Float[Array, " dim"], floor: fl
     return jnp.where(regular, cofactors(a).T @ b / jnp.where(regular, det, 1), 0)
 
 
-def unit_scale(points: Float[Array, "nodes dim"]) -> Float[Array, ""]:
-    """The power of two that scales the extent of `points` to between 1/2 and 1; a constant.
+def canonical(points: Float[Array, "nodes dim"]) -> tuple[Float[Array, "nodes dim"], Float[Array, ""]]:
+    """`points` moved to the origin and scaled to an extent between 1/2 and 1, and the scale: constants.
 
-    Multiplying by it is exact, so what is computed on scaled points does not depend on the unit of
-    length, and their products neither over- nor underflow.
+    The scale is a power of two, so multiplying by it is exact: what is computed from these points does not
+    depend on the unit of length, nor on where the origin is, and neither over- nor underflows.
     """
-    extent = jax.lax.stop_gradient(jnp.ptp(points, axis=0).max())
-    return jnp.ldexp(jnp.ones((), points.dtype), -jnp.frexp(extent)[1])
+    low = jax.lax.stop_gradient(points.min(axis=0))
+    extent = jax.lax.stop_gradient(points.max(axis=0)) - low
+    scale = jnp.ldexp(jnp.ones((), points.dtype), -jnp.frexp(extent.max())[1])
+    return (points - low) * scale, scale

@@ -19,7 +19,7 @@ from jaxsmooth.mesh import Mesh, gather, scatter_add
 from jaxsmooth.methods.base import Method, Proposal
 from jaxsmooth.metrics import measure, shape_quality
 from jaxsmooth.patches import Evaluation, PatchGuard, patch_mean
-from jaxsmooth.small import least, unit_scale
+from jaxsmooth.small import canonical, least
 from jaxsmooth.solve import solve_projected
 
 __all__ = ["Elastic"]
@@ -57,8 +57,8 @@ class Elastic(Method):
 
     def propose(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Proposal:
         """Solve K U = F (Eqs. 31–36) in the null space of the constraints."""
-        unit = unit_scale(mesh.points)
-        mesh = mesh.with_points(mesh.points * unit)
+        points, unit = canonical(mesh.points)
+        mesh = mesh.with_points(points)
         count = len(mesh.points)
         force = jnp.zeros_like(mesh.points)
         blocks = []

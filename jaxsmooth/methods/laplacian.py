@@ -16,7 +16,7 @@ from jaxsmooth.mesh import Mesh, gather, scatter_add
 from jaxsmooth.methods.base import Method, Proposal
 from jaxsmooth.metrics import min_jacobian, shape_quality
 from jaxsmooth.patches import Evaluation, Guarded, PatchGuard, patch_min
-from jaxsmooth.small import contract, determinant, unit_scale
+from jaxsmooth.small import canonical, contract, determinant
 from jaxsmooth.topology import node_pairs
 
 __all__ = ["Laplacian", "SmartGuard"]
@@ -94,13 +94,14 @@ def _moments(kind: ElementType, nodes: Float[Array, "k dim"]) -> Float[Array, " 
 
 
 class RisingGuard(PatchGuard):
-    """Take back the move of every node whose patch has not risen, until all others' have."""
+    """Take back the move of every node whose patch has not risen by more than `noise`."""
 
+    noise: Float[Array, ""] | float = 0.0
     halvings: int = eqx.field(static=True, default=0)
 
     def threshold(self, least: Float[Array, " nodes"], floor: Float[Array, ""]) -> Float[Array, " nodes"]:
-        """Above the least quality by more than rounding."""
-        return least + 2 * rounding(least)
+        """Above the least quality by more than the noise, of which a part is forgiven later."""
+        return least + 2 * self.noise
 
 
 class SmartGuard(eqx.Module):
@@ -121,18 +122,15 @@ class SmartGuard(eqx.Module):
     def __call__(self, mesh: Mesh, move: Field, before: Evaluation, beta=2.0) -> Guarded:
         """Move the nodes of `mesh` by `move` ``[nodes, dim]`` where the patches profit."""
         stopped = jax.lax.stop_gradient
-        scale = unit_scale(mesh.points)
-        frozen, plain, start = (
-            mesh.with_points(stopped(mesh.points) * scale),
-            stopped(move) * scale,
-            stopped(before),
-        )
-        together = RisingGuard()
+        points, scale = canonical(stopped(mesh.points))
+        frozen, plain, start = mesh.with_points(points), stopped(move) * scale, stopped(before)
+        noise = rounding(mesh.points) * jnp.maximum(1, scale * jnp.abs(stopped(mesh.points)).max())
+        together = RisingGuard(noise=noise)
 
         def best(points: Field, evaluation: Evaluation, waiting: Array) -> Bool[Array, " nodes"]:
             """Waiting nodes that gain, and no less than any node they share an element with."""
             current = frozen.with_points(points)
-            gain = jnp.where(waiting, gains(current, plain, evaluation, beta), -jnp.inf)
+            gain = jnp.where(waiting, gains(current, plain, evaluation, noise, beta), -jnp.inf)
             rival = gain
             for _, nodes in frozen.blocks:
                 most = gather(gain, nodes).max(axis=1, keepdims=True)
@@ -154,10 +152,10 @@ class SmartGuard(eqx.Module):
         return Guarded(points, after, (waiting & ~accepted).sum(), rounds)
 
 
-def gains(mesh: Mesh, move: Field, before: Evaluation, beta) -> Float[Array, " nodes"]:
+def gains(mesh: Mesh, move: Field, before: Evaluation, noise, beta) -> Float[Array, " nodes"]:
     """By how much the least quality of each patch rises if its node alone moves.
 
-    −∞ where it does not rise, or where a valid element would turn inverted.
+    −∞ where that is noise, or where a valid element would turn inverted.
     """
     after = jnp.full(len(mesh.points), jnp.inf, mesh.points.dtype)
     for (kind, nodes), det in zip(mesh.blocks, before.jacobian, strict=True):
@@ -167,12 +165,13 @@ def gains(mesh: Mesh, move: Field, before: Evaluation, beta) -> Float[Array, " n
         turned = ~(jax.vmap(jax.vmap(partial(min_jacobian, kind)))(variants) > 0) & (det > 0)[:, None]
         after = after.at[nodes].min(jnp.where(turned, -jnp.inf, each), mode="promise_in_bounds")
     risen = after - patch_min(mesh, before.quality)
-    return jnp.where(risen > rounding(risen), risen, -jnp.inf)  # so written, NaN gains nothing
+    return jnp.where(risen > noise, risen, -jnp.inf)  # so written, NaN gains nothing
 
 
-def rounding(quality: Float[Array, " nodes"]) -> float:
-    """A difference of qualities, which are of order 1, that means nothing.
+def rounding(points: Field) -> float:
+    """A difference of qualities, which are of order 1, that means nothing, in a mesh at the origin.
 
-    A mid-side node that slides along its straight side changes the quality by as much.
+    A mid-side node that slides along its straight side changes the quality by as much; by more where
+    coordinates far from the origin are rounded to fewer digits of the mesh.
     """
-    return 32 * float(jnp.finfo(quality.dtype).eps)
+    return 32 * float(jnp.finfo(points.dtype).eps)

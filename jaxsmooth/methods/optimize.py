@@ -17,7 +17,7 @@ from jaxsmooth.methods.elastic import Elastic, target_measures
 from jaxsmooth.minimise import Minimiser, Newton
 from jaxsmooth.objective import Aggregation, Problem, problem
 from jaxsmooth.patches import Evaluation, PatchGuard, evaluate
-from jaxsmooth.small import unit_scale
+from jaxsmooth.small import canonical
 
 __all__ = ["GOALS", "Optimize", "Stage"]
 
@@ -111,8 +111,8 @@ class Optimize(Method):
     def propose(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Proposal:
         """The displacement to the optimised mesh."""
         mesh, constraints = jax.lax.stop_gradient((mesh, constraints))
-        scale = unit_scale(mesh.points)
-        mesh = mesh.with_points(mesh.points * scale)
+        points, scale = canonical(mesh.points)
+        mesh = mesh.with_points(points)
         sizes = self._sizes(mesh, scale)
         stages = (_UNTANGLE,) * self.untangling_stages + GOALS[self.goal]
         stages = jax.tree.map(lambda *values: jnp.stack([jnp.asarray(v) for v in values]), *stages)
