@@ -46,8 +46,9 @@ class AcceptanceRule:
     """When a step of `smooth` counts: otherwise the run goes back to the last one that did, or to the input.
 
     The guard of a method looks at patches and elements; this looks at the whole mesh.  Against the
-    input there may be no more inverted elements, no more poor ones, no lower q_avg; q_min may not fall
-    below 0.2, nor the least scaled Jacobian below 0.1, unless they were there already.  Against the last
+    input there may be no more inverted elements, no more poor ones, no lower q_avg (unless inverted ones
+    have become fewer); q_min may not fall below 0.2, nor the least scaled Jacobian below 0.1, unless they
+    were there already.  Against the last
     step that counted neither of the two may fall at all, unless inverted or poor elements have become
     fewer, and something has to be better.
 
@@ -84,6 +85,7 @@ class AcceptanceRule:
             now: statistics of the step.
             rounding: differences of qualities that mean nothing.
         """
+        untangles = now.inverted < first.inverted
         fewer = (now.inverted, now.below) < (last.inverted, last.below)
         q, corner = min(first.q_min, POOR), min(first.scaled_jacobian_min, _CLOSED)
         if not fewer:
@@ -94,7 +96,7 @@ class AcceptanceRule:
             (now.below <= (first if fewer else last).below + self.below, Status.MORE_POOR),
             (now.q_min >= q - self.quality - rounding, Status.LOWER_MINIMUM),
             (now.scaled_jacobian_min >= corner - self.corner - rounding, Status.LOWER_CORNER),
-            (now.q_avg >= first.q_avg - self.average - rounding, Status.LOWER_AVERAGE),
+            (untangles or now.q_avg >= first.q_avg - self.average - rounding, Status.LOWER_AVERAGE),
             (fewer or self._gains(last, now), Status.NO_GAIN),
         )
         return next((status for holds, status in kept if not holds), None)

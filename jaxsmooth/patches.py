@@ -144,11 +144,13 @@ class PatchGuard(eqx.Module):
     def __call__(self, mesh: Mesh, move: Field, before: Evaluation, beta=2.0) -> Guarded:
         """Move the nodes of `mesh` by `move` ``[nodes, dim]``, as far as the patches allow."""
         stopped = jax.lax.stop_gradient
-        frozen, plain, start = mesh.with_points(stopped(mesh.points)), stopped(move), stopped(before)
-        moves = (plain != 0).any(axis=-1)
+        frozen, start = mesh.with_points(stopped(mesh.points)), stopped(before)
+        moves = (stopped(move) != 0).any(axis=-1)
+        finite = jnp.isfinite(stopped(move)).all(axis=-1)
+        plain = jnp.where(finite[:, None], stopped(move), 0)
         needs = self._needs(frozen, moves, start)
         more = _extra_halvings(frozen, plain) if self.halvings else 0
-        limit = jnp.where(moves, self.halvings + more, -1)
+        limit = jnp.where(moves & finite, self.halvings + more, -1)
 
         def sweep(state):
             count, _, bad, sweeps = state

@@ -181,12 +181,13 @@ class _Driver:
 
         Returns the mesh of the last step that counts, its evaluation, and why the run ended.
         """
-        reached, stricter = (mesh, evaluation), method.stricter
+        reached, refused = (mesh, evaluation), None
+        attempts = list(method.attempts(tangled=self.history[0].statistics.inverted > 0))
         waiting: list[StepRecord] = []  # steps that do not count, unless one after them does
         settled = 0
         while (index := len(self.history) + len(waiting)) <= steps:
             start = time.perf_counter()
-            step = _step(method, mesh, self.constraints, evaluation)
+            step = _step(attempts[0], mesh, self.constraints, evaluation)
             if not bool(jnp.isfinite(step.points).all()):
                 return reached, Status.NOT_FINITE if bool(jnp.isfinite(step.residual)) else Status.UNSOLVED
             still = bool((step.points == mesh.points).all()) and not waiting
@@ -198,15 +199,19 @@ class _Driver:
             waiting.append(StepRecord(index, now, *counts, time.perf_counter() - start))
             refusal = None if still else self._objection(now, mesh)
             if refusal is None:
+                if self.history[-1].statistics.inverted and not now.inverted:
+                    attempts, done = list(method.attempts(tangled=False)), False
                 for row in waiting:
                     self.record(row)
                 reached, waiting = (mesh, evaluation), []
                 if done:
-                    return reached, Status.STALLED if still and counts[2] else Status.CONVERGED
+                    status = Status.STALLED if still and counts[2] else Status.CONVERGED
+                    return reached, refused or status
+                refused = None
             elif done or len(waiting) > _EXCURSION or index == steps:
-                if stricter is None or (settled and len(waiting) == 1):
+                if len(attempts) == 1 or (settled and len(waiting) == 1 and not now.inverted):
                     return reached, Status.CONVERGED if settled else refusal
-                method, stricter, settled = stricter, None, 0
+                attempts, settled, refused = attempts[1:], 0, refusal
                 (mesh, evaluation), waiting = reached, []
         return reached, Status.STEP_LIMIT
 

@@ -60,7 +60,7 @@ def run(mesh, held, method=None):
 
 
 def least(mesh):
-    q, det = evaluate(mesh)
+    q, det, _ = evaluate(mesh)
     return float(jnp.concatenate(q).min()), float(jnp.concatenate(det).min())
 
 
@@ -250,7 +250,7 @@ def test_an_element_that_stays_inverted_does_not_stop_the_others():
     constraints = Constraints.hold(mesh, held)
     task = problem(mesh, constraints, (jnp.full(64, 1 / 64),), Aggregation(1.0, 1.0, 4.0))
     np.testing.assert_array_equal(np.flatnonzero(task.hopeless(mesh.points)[0]), [0])
-    q, det = (np.asarray(part[0]) for part in evaluate(run(mesh, held)))
+    q, det, _ = (np.asarray(part[0]) for part in evaluate(run(mesh, held)))
     assert (det[1:] > 0).all()
     assert q[1:].mean() > 0.97
 

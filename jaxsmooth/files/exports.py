@@ -48,7 +48,6 @@ _HOLDS = {
 
 _SURFACES = {"stl", "obj", "off", "ply", "svg", "wkt", "neuroglancer"}
 _ONE_BLOCK = {"med", "hmf", "h5m"}  # of a type
-_SEVERAL_FILES = {"tetgen": ".node and .ele", "dolfin-xml": "one for every data array"}
 _NEEDS = {"exodus": "netCDF4", "med": "h5py", "h5m": "h5py", "hmf": "h5py", "cgns": "h5py", "xdmf": "h5py"}
 
 
@@ -57,11 +56,8 @@ def check_writable(format: str) -> None:
     stem = stem_format(format)
     if stem not in _writer_map and stem not in _WRITERS:
         raise MeshFileError(f"nothing writes {stem} files; write .vtu, .msh or .xdmf instead")
-    if stem in _SEVERAL_FILES:
-        raise MeshFileError(
-            f"{stem} meshes are several files ({_SEVERAL_FILES[stem]}), which are not written; "
-            "write .vtu or .msh instead"
-        )
+    if stem == "dolfin-xml":
+        raise MeshFileError("dolfin-xml files have no room for data, tags and sets; write .xdmf instead")
     if (package := _NEEDS.get(stem)) and importlib.util.find_spec(package) is None:
         raise MeshFileError(
             f"writing {stem} files needs {package}; install it with: pip install 'jaxsmooth[io]'"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -53,12 +54,20 @@ class Method(eqx.Module):
         """What a run with this method keeps of its input, unless the user says otherwise."""
         return AcceptanceRule() if self.guard is not None else AcceptanceRule.anything()
 
-    @property
-    def stricter(self) -> Method | None:
-        """The method with a guard that lets q_min and the least scaled Jacobian of a mesh never fall."""
+    def attempts(self, tangled: bool) -> tuple[Method, ...]:
+        """The method with guards from loose to strict: a run goes on with the next where one leads nowhere.
+
+        The strict one lets neither q_min nor the least scaled Jacobian of a mesh fall.  While elements
+        are inverted, a first one looks at nothing but inversion.  Only numbers differ, so that all
+        share their compiled step.
+        """
         if not isinstance(self.guard, PatchGuard):
-            return None
-        return eqx.tree_at(lambda method: method.guard.keep, self, 1.0)
+            return (self,)
+        strict = self._guarded(keep=1.0)
+        return (self._guarded(gamma=0.0, poor=0.0, corner=0.0), self, strict) if tangled else (self, strict)
+
+    def _guarded(self, **numbers: float) -> Method:
+        return eqx.tree_at(lambda method: method.guard, self, replace(self.guard, **numbers))
 
     @abc.abstractmethod
     def propose(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Proposal:

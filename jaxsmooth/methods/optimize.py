@@ -108,6 +108,10 @@ class Optimize(Method):
         if (self.target == "given size") != (self.size is not None):
             raise ValueError("size goes with target='given size', and only with it")
 
+    def attempts(self, tangled: bool) -> tuple[Method, ...]:
+        """As for other methods, but the objective is trusted first: it has a barrier of its own."""
+        return super().attempts(tangled=True)
+
     def propose(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Proposal:
         """The displacement to the optimised mesh."""
         mesh, constraints = jax.lax.stop_gradient((mesh, constraints))
