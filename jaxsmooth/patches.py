@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsmooth.acceptance import OPEN
 from jaxsmooth.elements import ElementType
 from jaxsmooth.mesh import Mesh, gather
 from jaxsmooth.metrics import measure, scaled_jacobian, shape_quality
@@ -117,7 +118,8 @@ class PatchGuard(eqx.Module):
     Beyond Eq. 34 no single element may turn inverted, nor fall below a floor of its quality or of its
     scaled Jacobian (q is blunt about corners); patches that are below may not get worse.  So poor
     elements never get more.  The floors are `poor` and `corner`, or the part `keep` of what the worst
-    element of the mesh has, where that is more.
+    element of the mesh has, where that is more (of a scaled Jacobian no more than 0.5: above that it does
+    not matter how open a corner is).
 
     The accepted fractions of the moves are constants for differentiation.
 
@@ -173,6 +175,7 @@ class PatchGuard(eqx.Module):
         floor, least = _floor(self.poor, self.keep, start.quality)
         node = jnp.where(moves, self.threshold(patch_min(mesh, start.quality), floor), -jnp.inf)
         corner_floor, corner_least = _floor(self.corner, self.keep, start.corners)
+        corner_floor = jnp.minimum(corner_floor, jnp.maximum(self.corner, OPEN))
         corner_patch = patch_min(mesh, start.corners)
         needs = []
         for (_, nodes), q, det, corner in zip(mesh.blocks, *start, strict=True):
