@@ -10,7 +10,7 @@ __all__ = ["OPEN", "POOR", "AcceptanceRule", "Statistics", "Status"]
 
 POOR = 0.2  # quality below which an element counts as poor (Tables 7 and 8)
 _CLOSED = 0.1  # scaled Jacobian below which a corner is as good as closed
-OPEN = 0.5  # scaled Jacobian above which it does not matter how open a corner is
+OPEN = 0.7  # scaled Jacobian above which it does not matter how open a corner is
 
 
 class Status(enum.StrEnum):
@@ -50,7 +50,7 @@ class AcceptanceRule:
     input there may be no more inverted elements, no more poor ones, no lower q_avg (unless inverted ones
     have become fewer); q_min may not fall below 0.2, nor the least scaled Jacobian below 0.1, unless they
     were there already.  Against the last
-    step that counted neither of the two may fall at all, the scaled Jacobian where it is below 0.5, unless
+    step that counted neither of the two may fall at all, the scaled Jacobian where it is below 0.7, unless
     inverted or poor elements have become fewer, and something has to be better.
 
     The attributes loosen this; ∞ takes a demand away.

@@ -118,7 +118,7 @@ class PatchGuard(eqx.Module):
     Beyond Eq. 34 no single element may turn inverted, nor fall below a floor of its quality or of its
     scaled Jacobian (q is blunt about corners); patches that are below may not get worse.  So poor
     elements never get more.  The floors are `poor` and `corner`, or the part `keep` of what the worst
-    element of the mesh has, where that is more (of a scaled Jacobian no more than 0.5: above that it does
+    element of the mesh has, where that is more (of a scaled Jacobian no more than 0.7: above that it does
     not matter how open a corner is).
 
     The accepted fractions of the moves are constants for differentiation.

@@ -209,7 +209,8 @@ class _Driver:
                     return reached, refused or status
                 refused = None
             elif done or len(waiting) > _EXCURSION or index == steps:
-                if len(attempts) == 1 or (settled and len(waiting) == 1 and not now.inverted):
+                last = self.history[-1].step > 0 and settled and len(waiting) == 1 and not now.inverted
+                if len(attempts) == 1 or last:
                     return reached, Status.CONVERGED if settled else refusal
                 attempts, settled, refused = attempts[1:], 0, refusal
                 (mesh, evaluation), waiting = reached, []

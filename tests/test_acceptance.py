@@ -29,7 +29,7 @@ POOR = Statistics(0.1, 1.0, 0.8, 0.1, below=7, inverted=2, scaled_jacobian_min=-
         (GOOD, {"below": 1, "q_avg": 0.9}, Status.MORE_POOR),
         (GOOD, {"q_min": 0.49, "q_avg": 0.9}, Status.LOWER_MINIMUM),
         (GOOD, {"scaled_jacobian_min": 0.39, "q_avg": 0.9}, Status.LOWER_CORNER),
-        (replace(GOOD, scaled_jacobian_min=0.99), {"scaled_jacobian_min": 0.5, "q_avg": 0.9}, None),
+        (replace(GOOD, scaled_jacobian_min=0.99), {"scaled_jacobian_min": 0.7, "q_avg": 0.9}, None),
         (GOOD, {"q_avg": 0.79, "q_min": 0.6}, Status.LOWER_AVERAGE),
         (GOOD, {"q_avg": float("nan"), "q_min": 0.6}, Status.LOWER_AVERAGE),
         (POOR, {"inverted": 1}, None),
