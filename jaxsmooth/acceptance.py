@@ -10,6 +10,7 @@ __all__ = ["OPEN", "POOR", "AcceptanceRule", "Statistics", "Status"]
 
 POOR = 0.2  # quality below which an element counts as poor (Tables 7 and 8)
 _CLOSED = 0.1  # scaled Jacobian below which a corner is as good as closed
+_NARROW = 0.3  # the least that solvers accept for quadrilaterals, by Verdict's manual
 OPEN = 0.7  # scaled Jacobian above which it does not matter how open a corner is
 
 
@@ -47,11 +48,12 @@ class AcceptanceRule:
     """When a step of `smooth` counts: otherwise the run goes back to the last one that did, or to the input.
 
     The guard of a method looks at patches and elements; this looks at the whole mesh.  Against the
-    input there may be no more inverted elements, no more poor ones, no lower q_avg (unless inverted ones
-    have become fewer); q_min may not fall below 0.2, nor the least scaled Jacobian below 0.1, unless they
+    input there may be no more inverted elements, no more poor ones, no lower q_avg (unless a tangled mesh
+    has become valid); q_min may not fall below 0.2, nor the least scaled Jacobian below 0.1, unless they
     were there already.  Against the last
     step that counted neither of the two may fall at all, the scaled Jacobian where it is below 0.7, unless
-    inverted or poor elements have become fewer, and something has to be better.
+    inverted or poor elements have become fewer (for fewer poor ones it may fall to 0.3), and something has
+    to be better.
 
     The attributes loosen this; ∞ takes a demand away.
 
@@ -86,18 +88,20 @@ class AcceptanceRule:
             now: statistics of the step.
             rounding: differences of qualities that mean nothing.
         """
-        untangles = now.inverted < first.inverted
+        untangled = first.inverted > now.inverted == 0
         fewer = (now.inverted, now.below) < (last.inverted, last.below)
         q, corner = min(first.q_min, POOR), min(first.scaled_jacobian_min, _CLOSED)
         if not fewer:
             q, corner = max(q, last.q_min), max(corner, min(last.scaled_jacobian_min, OPEN))
+        elif now.inverted == last.inverted:
+            corner = max(corner, min(first.scaled_jacobian_min, _NARROW))
         # so written, NaN breaks them
         kept = (
             (now.inverted <= last.inverted + self.inverted, Status.MORE_INVERTED),
             (now.below <= (first if fewer else last).below + self.below, Status.MORE_POOR),
             (now.q_min >= q - self.quality - rounding, Status.LOWER_MINIMUM),
             (now.scaled_jacobian_min >= corner - self.corner - rounding, Status.LOWER_CORNER),
-            (untangles or now.q_avg >= first.q_avg - self.average - rounding, Status.LOWER_AVERAGE),
+            (untangled or now.q_avg >= first.q_avg - self.average - rounding, Status.LOWER_AVERAGE),
             (fewer or self._gains(last, now), Status.NO_GAIN),
         )
         return next((status for holds, status in kept if not holds), None)

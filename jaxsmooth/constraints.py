@@ -176,7 +176,8 @@ class _Directions:
     def add(self, nodes: np.ndarray, found: _Vectors) -> None:
         """Add vectors to all nodes ``[m, k]`` of the facets or segments that have them."""
         known = found.known
-        weight = 1 / np.clip(_USUAL * self.size / found.height[known], _FLAT, _ROUGH) ** 2
+        # a facet that is hardly more than a point weighs next to nothing
+        weight = 1 / np.clip(_USUAL * self.size / found.height[known], _FLAT, 1e8) ** 2
         self.parts.append((nodes[known], found.vectors[known], 1 / found.tolerance[known] ** 2, weight))
         if not known.all():
             self.joined.append(nodes[~known])

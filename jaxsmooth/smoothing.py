@@ -155,7 +155,7 @@ def smooth(
 
 
 _PATIENCE = 3  # steps without change after which a mesh is taken to stay tangled
-_EXCURSION = 2  # steps that may break the rule before one that meets it again
+_EXCURSION = 2  # steps that may break the rule, and untangle nothing, before one that meets it again
 
 
 @dataclass
@@ -184,7 +184,7 @@ class _Driver:
         reached, refused = (mesh, evaluation), None
         attempts = list(method.attempts(tangled=self.history[0].statistics.inverted > 0))
         waiting: list[StepRecord] = []  # steps that do not count, unless one after them does
-        settled = 0
+        settled = lost = 0
         while (index := len(self.history) + len(waiting)) <= steps:
             start = time.perf_counter()
             step = _step(attempts[0], mesh, self.constraints, evaluation)
@@ -196,6 +196,8 @@ class _Driver:
             counts = int(step.iterations), float(step.residual), int(step.shortened)
             settled = settled + 1 if self._settled((waiting or self.history)[-1].statistics, now) else 0
             done = still or settled >= (_PATIENCE if now.inverted else 1)
+            fewest = min(row.statistics.inverted for row in (self.history[-1], *waiting))
+            lost = 0 if now.inverted < fewest else lost + 1
             waiting.append(StepRecord(index, now, *counts, time.perf_counter() - start))
             refusal = None if still else self._objection(now, mesh)
             if refusal is None:
@@ -203,17 +205,17 @@ class _Driver:
                     attempts, done = list(method.attempts(tangled=False)), False
                 for row in waiting:
                     self.record(row)
-                reached, waiting = (mesh, evaluation), []
+                reached, waiting, lost = (mesh, evaluation), [], 0
                 if done:
                     status = Status.STALLED if still and counts[2] else Status.CONVERGED
                     return reached, refused or status
                 refused = None
-            elif done or len(waiting) > _EXCURSION or index == steps:
+            elif done or lost > _EXCURSION or index == steps:
                 last = self.history[-1].step > 0 and settled and len(waiting) == 1 and not now.inverted
                 if len(attempts) == 1 or last:
                     return reached, Status.CONVERGED if settled else refusal
                 attempts, settled, refused = attempts[1:], 0, refusal
-                (mesh, evaluation), waiting = reached, []
+                (mesh, evaluation), waiting, lost = reached, [], 0
         return reached, Status.STEP_LIMIT
 
     def _objection(self, now: Statistics, mesh: Mesh) -> Status | None:
