@@ -19,6 +19,9 @@ from jaxsmooth.patches import Evaluation, Guarded, PatchGuard, evaluate
 __all__ = ["Method", "Proposal", "Step"]
 
 
+_NEXT_TO_NOTHING = 1e-9  # a floor that only inverted elements are below
+
+
 class Proposal(NamedTuple):
     """A displacement ``[nodes, dim]`` and what it cost: solver iterations, relative residual."""
 
@@ -55,16 +58,22 @@ class Method(eqx.Module):
         return AcceptanceRule() if self.guard is not None else AcceptanceRule.anything()
 
     def attempts(self, tangled: bool) -> tuple[Method, ...]:
-        """The method with guards from loose to strict: a run goes on with the next where one leads nowhere.
+        """The method, and with other guards: a run goes on with the next where one leads nowhere.
 
-        The strict one lets neither q_min nor the least scaled Jacobian of a mesh fall.  While elements
-        are inverted, a first one looks at nothing but inversion.  Only numbers differ, so that all
-        share their compiled step.
+        The last is strict: it lets neither q_min nor the least scaled Jacobian of a mesh fall.  While
+        elements are inverted, two looser ones come first; they look at inversion, and one of them at
+        what turns worse than all there is.  Only numbers differ, so that all share their compiled step.
         """
         if not isinstance(self.guard, PatchGuard):
             return (self,)
-        strict = self._guarded(keep=1.0)
-        return (self._guarded(gamma=0.0, poor=0.0, corner=0.0), self, strict) if tangled else (self, strict)
+        looser = self._looser() if tangled else ()
+        return (*looser, self, self._guarded(keep=1.0))
+
+    def _looser(self) -> tuple[Method, Method]:
+        return (
+            self._guarded(gamma=0.0, poor=_NEXT_TO_NOTHING, corner=_NEXT_TO_NOTHING),
+            self._guarded(gamma=0.0, poor=0.0, corner=0.0),
+        )
 
     def _guarded(self, **numbers: float) -> Method:
         return eqx.tree_at(lambda method: method.guard, self, replace(self.guard, **numbers))

@@ -110,7 +110,9 @@ class Optimize(Method):
 
     def attempts(self, tangled: bool) -> tuple[Method, ...]:
         """As for other methods, but the objective is trusted first: it has a barrier of its own."""
-        return super().attempts(tangled=True)
+        if not isinstance(self.guard, PatchGuard):
+            return (self,)
+        return (*reversed(self._looser()), *super().attempts(tangled=False))
 
     def propose(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Proposal:
         """The displacement to the optimised mesh."""
