@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsmooth.acceptance import OPEN
 from jaxsmooth.elements import ElementType
 from jaxsmooth.mesh import Mesh, gather
-from jaxsmooth.metrics import measure, scaled_jacobian, shape_quality
+from jaxsmooth.metrics import min_jacobian, scaled_jacobian, shape_quality
 from jaxsmooth.small import canonical
 from jaxsmooth.validity import determinant_bound
 
@@ -34,31 +34,42 @@ class Evaluation(NamedTuple):
         quality: the paper's q (Eqs. 1–5).
         jacobian: a bound of the Jacobian determinant, of the mesh scaled to about unit size: where it
             is positive the element is valid everywhere; else it is inverted, or not proven valid.
-        corners: scaled Jacobian, which sees single corners, as q does not.
+        corners: scaled Jacobian, which sees single corners; None for triangles and tetrahedra, of
+            which q does.
     """
 
     quality: Blocks
     jacobian: Blocks
-    corners: Blocks
+    corners: tuple[Float[Array, " elements"] | None, ...]
 
 
 def evaluate(mesh: Mesh, beta: Float[Array, ""] | float = 2.0) -> Evaluation:
     """Quality, validity and corners of all elements."""
     points, _ = canonical(mesh.points)
 
-    def element(kind: ElementType, nodes: Float[Array, "k dim"]) -> tuple[Array, Array, Array]:
+    def element(kind: ElementType, nodes: Float[Array, "k dim"]) -> tuple[Array, ...]:
         q = shape_quality(kind, nodes, beta)
+        if _sees_corners(kind):  # the determinant is constant, and that of q
+            return q, min_jacobian(kind, nodes)
         return q, determinant_bound(kind, nodes), scaled_jacobian(kind, nodes)
 
-    found = [_map_elements(partial(element, kind), points, nodes) for kind, nodes in mesh.blocks]
-    return Evaluation(*zip(*found, strict=True))
+    found = [_map_elements(kind, partial(element, kind), points, nodes) for kind, nodes in mesh.blocks]
+    return Evaluation(*zip(*((*values, None)[:3] for values in found), strict=True))
 
 
-def _map_elements(function: Callable, points: Field, nodes: Int[Array, "elements k"]) -> tuple[Array, ...]:
+def _sees_corners(kind: ElementType) -> bool:
+    """Whether a fair q means open corners: of straight simplices, whose Jacobian is constant."""
+    return len(kind.validity_gradients) == 1
+
+
+def _map_elements(
+    kind: ElementType, function: Callable, points: Field, nodes: Int[Array, "elements k"]
+) -> tuple[Array, ...]:
     """`function` of every element ``[k, dim]``, chunk by chunk on CPU: what lies in cache is not
     written to memory between gather and result, which makes it two to three times as fast."""
     count = len(nodes)
-    size = min(count, _CPU_CHUNK) if jax.default_backend() == "cpu" else count
+    chunk = _CPU_CHUNK * (4 if _sees_corners(kind) else 1)
+    size = min(count, chunk) if jax.default_backend() == "cpu" else count
     chunks = -(-count // max(size, 1))
     padded = jnp.pad(nodes, ((0, chunks * size - count), (0, 0)), mode="edge")
     found = jax.lax.map(
@@ -67,10 +78,12 @@ def _map_elements(function: Callable, points: Field, nodes: Int[Array, "elements
     return tuple(values.reshape(-1)[:count] for values in found)
 
 
-def patch_min(mesh: Mesh, values: Blocks) -> Float[Array, " nodes"]:
-    """Least value of each patch; +inf at nodes without elements."""
+def patch_min(mesh: Mesh, values: tuple[Float[Array, " elements"] | None, ...]) -> Float[Array, " nodes"]:
+    """Least value of each patch, but for blocks without values; +inf at nodes without elements."""
     least = jnp.full(len(mesh.points), jnp.inf, mesh.points.dtype)
     for (_, nodes), value in zip(mesh.blocks, values, strict=True):
+        if value is None:
+            continue
         least = least.at[nodes].min(value[:, None], mode="promise_in_bounds")
     return least
 
@@ -104,7 +117,7 @@ class _Needs(NamedTuple):
     node: tuple[Float[Array, "elements k"], ...]
     quality: Blocks
     jacobian: Blocks
-    corners: Blocks
+    corners: tuple[Float[Array, " elements"] | None, ...]
 
 
 class PatchGuard(eqx.Module):
@@ -116,10 +129,10 @@ class PatchGuard(eqx.Module):
     because elements whose nodes do not move offend nobody: that is the old mesh.
 
     Beyond Eq. 34 no single element may turn inverted, nor fall below a floor of its quality or of its
-    scaled Jacobian (q is blunt about corners); patches that are below may not get worse.  So poor
-    elements never get more.  The floors are `poor` and `corner`, or the part `keep` of what the worst
-    element of the mesh has, where that is more (of a scaled Jacobian no more than 0.7: above that it does
-    not matter how open a corner is).
+    scaled Jacobian (q is blunt about the corners of all but simplices); patches that are below may not get
+    worse.  So poor elements never get more.  The floors are `poor` and `corner`, or the part `keep` of what
+    the worst element of the mesh has, where that is more (of a scaled Jacobian no more than 0.7: above that
+    it does not matter how open a corner is).
 
     The accepted fractions of the moves are constants for differentiation.
 
@@ -151,7 +164,7 @@ class PatchGuard(eqx.Module):
         finite = jnp.isfinite(stopped(move)).all(axis=-1)
         plain = jnp.where(finite[:, None], stopped(move), 0)
         needs = self._needs(frozen, moves, start)
-        more = _extra_halvings(frozen, plain) if self.halvings else 0
+        more = _extra_halvings(frozen, plain, start) if self.halvings else 0
         limit = jnp.where(moves & finite, self.halvings + more, -1)
 
         def sweep(state):
@@ -161,11 +174,11 @@ class PatchGuard(eqx.Module):
             return count, after, _offenders(frozen, needs, after, count > limit), sweeps + 1
 
         def unfinished(state):
-            count, _, bad, _ = state
-            return (bad & (count <= limit)).any()
+            count, _, bad, sweeps = state
+            return (sweeps == 0) | (bad & (count <= limit)).any()
 
-        count = jnp.zeros(len(mesh.points), jnp.int32)
-        state = sweep((count, start, jnp.zeros_like(moves), jnp.int32(0)))
+        nothing = jnp.zeros(len(mesh.points), jnp.int32)
+        state = nothing, start, nothing > 0, jnp.int32(0)
         count, after, _, sweeps = jax.lax.while_loop(unfinished, sweep, state)
         part = checkpoint_name(fraction(count, limit), "accepted")
         return Guarded(moved(mesh, move, part).points, after, (moves & (part < 1)).sum(), sweeps)
@@ -179,17 +192,15 @@ class PatchGuard(eqx.Module):
         corner_patch = patch_min(mesh, start.corners)
         needs = []
         for (_, nodes), q, det, corner in zip(mesh.blocks, *start, strict=True):
-            around = jnp.where(det > 0, gather(corner_patch, nodes).max(axis=1), corner_least)
+            need = gather(node, nodes) - slack, jnp.where(q >= floor, floor, least) - slack
+            if corner is None:
+                needs.append((*need, jnp.where(det > 0, 0, -jnp.inf), None))
+                continue
             # valid elements stay valid; those that are not proven, but open at all corners, as good
             proven = jnp.where(det > 0, 0, jnp.where(corner > 0, (1 + slack) * det, -jnp.inf))
-            needs.append(
-                (
-                    gather(node, nodes) - slack,
-                    jnp.where(q >= floor, floor, least) - slack,
-                    proven,
-                    jnp.where(corner >= corner_floor, corner_floor, around) - slack,
-                )
-            )
+            around = jnp.where(det > 0, gather(corner_patch, nodes).max(axis=1), corner_least)
+            open_ = jnp.where(corner >= corner_floor, corner_floor, around) - slack
+            needs.append((*need, proven, open_))
         return _Needs(*zip(*needs, strict=True))
 
 
@@ -197,7 +208,8 @@ def _floor(
     floor: Array | float, keep: Array | float, values: Blocks
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """`floor`, or a part of the least of all values where that is more, and that least; −∞ for no floor."""
-    least = jnp.stack([part.min() for part in values]).min()
+    parts = [part.min() for part in values if part is not None]
+    least = jnp.stack(parts).min() if parts else jnp.inf
     wanted = jnp.asarray(floor) > 0
     return jnp.where(wanted, jnp.maximum(floor, keep * least), -jnp.inf), jnp.where(wanted, least, -jnp.inf)
 
@@ -211,20 +223,18 @@ def _offenders(
         mesh.blocks, *needs, *after, strict=True
     ):
         own = ~(q[:, None] >= need)  # so written, NaN offends
-        whole = ~(q >= q_need) | ~(det > det_need) | ~(corner >= corner_need)
-        whole |= (own & gather(still, nodes)).any(axis=1)
+        whole = ~(q >= q_need) | ~(det > det_need) | (own & gather(still, nodes)).any(axis=1)
+        if corner is not None:
+            whole |= ~(corner >= corner_need)
         bad = bad.at[nodes].max(own | whole[:, None], mode="promise_in_bounds")
     return bad
 
 
-def _extra_halvings(mesh: Mesh, move: Field) -> Int[Array, " nodes"]:
+def _extra_halvings(mesh: Mesh, move: Field, start: Evaluation) -> Int[Array, " nodes"]:
     """Halvings that make a move as short as the least element around its node is large."""
-    points, unit = canonical(mesh.points)
-    sizes = [
-        _map_elements(lambda x, kind=kind: (jnp.abs(measure(kind, x)) ** (1 / kind.dim),), points, nodes)[0]
-        for kind, nodes in mesh.blocks
-    ]
-    local = patch_min(mesh, tuple(sizes))
+    _, unit = canonical(mesh.points)
+    sizes = tuple(jnp.abs(det) ** (1 / mesh.dim) for det in start.jacobian)
+    local = patch_min(mesh, sizes)
     length = jnp.abs(move).max(axis=-1) * unit
     ratio = jnp.where(jnp.isfinite(length) & (local > 0), length / jnp.where(local > 0, local, 1), 1)
     return jnp.ceil(jnp.log2(jnp.clip(ratio, 1, _LONGEST))).astype(jnp.int32)

@@ -15,9 +15,10 @@ from jaxtyping import Array, Float
 
 from jaxsmooth.acceptance import POOR, AcceptanceRule, Statistics, Status
 from jaxsmooth.constraints import Constraints, detect_constraints
-from jaxsmooth.mesh import Mesh
+from jaxsmooth.mesh import Mesh, gather
 from jaxsmooth.meshfile import as_mesh
 from jaxsmooth.methods import Elastic, Method
+from jaxsmooth.metrics import scaled_jacobian
 from jaxsmooth.patches import Evaluation, evaluate
 from jaxsmooth.runs import run
 from jaxsmooth.validity import inverted
@@ -68,10 +69,14 @@ class SmoothResult:
 
 
 @partial(jax.jit, static_argnames=("threshold",))
-def _summary(evaluation: Evaluation, threshold: float) -> tuple[Array, ...]:
+def _summary(mesh: Mesh, evaluation: Evaluation, threshold: float) -> tuple[Array, ...]:
     q = jnp.concatenate(evaluation.quality)
     deviation = jnp.std(q, ddof=1) if q.size > 1 else jnp.zeros((), q.dtype)
-    worst = jnp.stack([part.min() for part in evaluation.corners]).min()
+    corners = [
+        jax.vmap(partial(scaled_jacobian, kind))(gather(mesh.points, nodes)) if known is None else known
+        for (kind, nodes), known in zip(mesh.blocks, evaluation.corners, strict=True)
+    ]
+    worst = jnp.stack([part.min() for part in corners]).min()
     return q.min(), q.max(), q.mean(), deviation, worst, (q < threshold).sum()
 
 
@@ -79,7 +84,7 @@ def statistics(mesh: Any, evaluation: Evaluation | None = None, threshold: float
     """Statistics of a mesh; an `evaluation` that is already known saves time."""
     mesh = as_mesh(mesh)
     evaluation = _evaluate(_bare(mesh)) if evaluation is None else evaluation
-    *values, below = (value.item() for value in jax.device_get(_summary(evaluation, threshold)))
+    *values, below = (value.item() for value in jax.device_get(_summary(_bare(mesh), evaluation, threshold)))
     tangled = sum(int(part.sum()) for part in inverted(mesh, evaluation.jacobian))
     q_min, q_max, q_avg, q_std, worst = values
     return Statistics(q_min, q_max, q_avg, q_std, below, tangled, worst)
