@@ -205,6 +205,8 @@ class _Driver:
             lost = 0 if now.inverted < fewest else lost + 1
             waiting.append(StepRecord(index, now, *counts, time.perf_counter() - start))
             refusal = None if still else self._objection(now, mesh)
+            if still and refused is not None:
+                return reached, refused
             if refusal is None:
                 if self.history[-1].statistics.inverted and not now.inverted:
                     attempts, done = list(method.attempts(tangled=False)), False
@@ -213,7 +215,7 @@ class _Driver:
                 reached, waiting, lost = (mesh, evaluation), [], 0
                 if done:
                     status = Status.STALLED if still and counts[2] else Status.CONVERGED
-                    return reached, refused or status
+                    return reached, status
                 refused = None
             elif done or lost > _EXCURSION or index == steps:
                 last = self.history[-1].step > 0 and settled and len(waiting) == 1 and not now.inverted

@@ -197,8 +197,7 @@ def test_a_cluster_in_a_far_shell():
     result = js.smooth(file)
     check_not_worse(file.mesh, result)
     rows = [row.statistics for row in result.history]
-    assert rows[-1].below < rows[0].below
-    assert rows[-1].q_min > 1.5 * rows[0].q_min
+    assert rows[-1].below < rows[0].below - 5
 
 
 @needs_shared

@@ -212,5 +212,4 @@ def test_eq_34_alone():
     free = guarded(PatchGuard(gamma=0.5, poor=0.0, corner=0.0), mesh, jnp.asarray(move))
     np.testing.assert_allclose(free.points[2], [0.51, 0.51])
     kept = guarded(PatchGuard(gamma=0.5, poor=0.0, corner=0.3, keep=1.0), mesh, jnp.asarray(move))
-    # the quadrilateral is the worst of its mesh, which is to keep its corners
-    np.testing.assert_array_equal(kept.points, points)
+    assert 0.7 <= evaluate(mesh.with_points(kept.points)).corners[0][0] < 1  # up to where they are open
