@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxsmooth.acceptance import POOR
 from jaxsmooth.constraints import Constraints
 from jaxsmooth.distortion import METRICS
 from jaxsmooth.mesh import Mesh
@@ -39,7 +40,6 @@ class Stage(NamedTuple):
 
 
 _VALID = PatchGuard(gamma=0.0, poor=0.0, corner=0.0)  # only against inversion
-_KEEPS = PatchGuard(gamma=0.0)  # and against elements that turn poor
 _PATIENCE = 4  # untangling stages without success
 _UNTANGLE = Stage(0, 1, 2, untangling=True)  # unlike the mean of 1 − q, it grows without bound
 _REPAIR = Stage(1, 30, 32, repairing=True)
@@ -83,7 +83,7 @@ class Optimize(Method):
         untangling_steps: their number while elements are inverted.
         untangling_stages: bound on the minimisations that follow while elements are inverted; they end
             earlier when several of them have not made the inverted elements fewer.
-        guard: refuses moves that invert an element, make it poor, or worse if it is poor.
+        guard: refuses moves that invert an element; `smooth` tries stricter ones where that is not enough.
 
     A step is a whole optimisation; another one goes on from there.  It is not differentiable in reverse mode.
     """
@@ -99,7 +99,7 @@ class Optimize(Method):
     start_steps: int = 2
     untangling_steps: int = 10
     untangling_stages: int = eqx.field(static=True, default=20)
-    guard: PatchGuard | None = _KEEPS
+    guard: PatchGuard | None = _VALID
 
     def __check_init__(self):
         for name, known in (("goal", GOALS), ("metric", METRICS), ("target", TARGETS)):
@@ -109,10 +109,11 @@ class Optimize(Method):
             raise ValueError("size goes with target='given size', and only with it")
 
     def attempts(self, tangled: bool) -> tuple[Method, ...]:
-        """As for other methods, but the objective is trusted first: it has a barrier of its own."""
+        """The objective is trusted first, for it has a barrier of its own; then as for other methods."""
         if not isinstance(self.guard, PatchGuard):
             return (self,)
-        return (*reversed(self._looser()), *super().attempts(tangled=False))
+        usual = {"poor": POOR, "corner": PatchGuard().corner}
+        return (self, self._looser()[0], self._guarded(**usual), self._guarded(**usual, keep=1.0))
 
     def propose(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Proposal:
         """The displacement to the optimised mesh."""
