@@ -73,7 +73,7 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_num_cpu_devices", os.cpu_count())
     import jaxsmooth as js
-    from jaxsmooth.solve import gradient_tolerance
+    from jaxsmooth.numerics.solve import gradient_tolerance
 
     points, tetra = cube(options.cells)
     mesh = js.Mesh(points, {"tetra": tetra})

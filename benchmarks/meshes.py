@@ -64,12 +64,12 @@ def main() -> int:
 
 def smooth_file(path: Path, name: str, steps: int, boundary: str) -> str:
     """One row of the table.  Raises `ValueError` where a promise is broken."""
-    from jaxsmooth.constraints import detect_constraints
-    from jaxsmooth.io import read, write
+    from jaxsmooth.files.io import read, write
     from jaxsmooth.methods import METHODS
-    from jaxsmooth.report import movable_elements, summarise
-    from jaxsmooth.smoothing import smooth
-    from jaxsmooth.validity import inverted
+    from jaxsmooth.metrics.validity import inverted
+    from jaxsmooth.motion.detect import detect_constraints
+    from jaxsmooth.report.report import movable_elements, summarise
+    from jaxsmooth.runs.driver import smooth
 
     file = read(path)
     start = time.perf_counter()

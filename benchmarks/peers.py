@@ -37,8 +37,8 @@ def jaxsmooth(**options) -> Callable[..., Result]:
 
         jax.config.update("jax_enable_x64", True)
         import jaxsmooth as js
-        from jaxsmooth import minimise
         from jaxsmooth.methods import METHODS, Optimize
+        from jaxsmooth.methods.optimize import minimise
 
         mesh = js.Mesh(points, blocks)
         constraints = js.Constraints.hold(mesh, held)
@@ -118,8 +118,8 @@ def vtk(points: np.ndarray, blocks: Blocks, held: np.ndarray) -> Result:
     import vtk
     from vtk.util.numpy_support import numpy_to_vtk, vtk_to_numpy
 
-    from jaxsmooth.mesh import Mesh
-    from jaxsmooth.topology import node_pairs
+    from jaxsmooth.mesh.record import Mesh
+    from jaxsmooth.mesh.topology import node_pairs
 
     pairs = node_pairs(Mesh(points, blocks))
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
@@ -214,7 +214,7 @@ def load(path: Path) -> tuple[np.ndarray, Blocks, np.ndarray]:
 def row(name: str, points: np.ndarray, blocks: Blocks, held: np.ndarray, seconds: float | None) -> str:
     """One line of the table."""
     import jaxsmooth as js
-    from jaxsmooth.patches import evaluate
+    from jaxsmooth.metrics.evaluation import evaluate
 
     mesh = js.Mesh(points, blocks)
     evaluation = evaluate(mesh)

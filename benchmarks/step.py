@@ -25,8 +25,8 @@ def main() -> None:
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", options.precision == "float64")
     import jaxsmooth as js
-    from jaxsmooth.fitting import rotation, rotation_svd
-    from jaxsmooth.patches import evaluate
+    from jaxsmooth.metrics.evaluation import evaluate
+    from jaxsmooth.numerics.rotation import rotation, rotation_svd
 
     if options.file:
         file = js.read(options.file)

@@ -15,39 +15,47 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 _HOMES = {
-    "acceptance": ("AcceptanceRule", "Statistics", "Status"),
-    "batch": ("Batch", "stack"),
-    "constraints": ("Constraints", "detect_constraints"),
-    "elasticity": ("Material",),
-    "elements": ("element_type",),
-    "io": ("read", "write"),
-    "layers": ("boundary_layers", "stretched"),
-    "mesh": ("Labels", "Mesh"),
-    "meshfile": ("MeshFile", "as_mesh", "from_meshio"),
+    "cells.table": ("element_type",),
+    "convert.meshfile": ("MeshFile", "as_mesh", "from_meshio"),
+    "files.io": ("read", "write"),
+    "guards.acceptance": ("AcceptanceRule", "Status"),
+    "guards.base": ("Guard",),
+    "guards.patch": ("PatchGuard",),
+    "mesh.layers": ("boundary_layers", "stretched"),
+    "mesh.record": ("Labels", "Mesh"),
     "methods": ("METHODS", "Elastic", "Laplacian", "Method", "Optimize"),
-    "patches": ("PatchGuard",),
-    "metrics": ("METRICS", "quality", "quality_mean"),
-    "runs": ("FixedPoint", "fixed_point", "run", "step"),
-    "smoothing": ("SmoothResult", "smooth", "statistics"),
+    "methods.elastic.elasticity": ("Material",),
+    "metrics.summary": ("Statistics", "statistics"),
+    "metrics.table": ("METRICS", "quality", "quality_mean"),
+    "motion.base": ("Motion",),
+    "motion.detect": ("detect_constraints",),
+    "motion.planar": ("Constraints",),
+    "runs.batch": ("Batch", "stack"),
+    "runs.driver": ("SmoothResult", "smooth"),
+    "runs.pure": ("FixedPoint", "fixed_point", "run", "step"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = sorted(_HOME)
 
 if TYPE_CHECKING:
-    from jaxsmooth.acceptance import AcceptanceRule, Statistics, Status
-    from jaxsmooth.batch import Batch, stack
-    from jaxsmooth.constraints import Constraints, detect_constraints
-    from jaxsmooth.elasticity import Material
-    from jaxsmooth.elements import element_type
-    from jaxsmooth.io import read, write
-    from jaxsmooth.layers import boundary_layers, stretched
-    from jaxsmooth.mesh import Labels, Mesh
-    from jaxsmooth.meshfile import MeshFile, as_mesh, from_meshio
+    from jaxsmooth.cells.table import element_type
+    from jaxsmooth.convert.meshfile import MeshFile, as_mesh, from_meshio
+    from jaxsmooth.files.io import read, write
+    from jaxsmooth.guards.acceptance import AcceptanceRule, Status
+    from jaxsmooth.guards.base import Guard
+    from jaxsmooth.guards.patch import PatchGuard
+    from jaxsmooth.mesh.layers import boundary_layers, stretched
+    from jaxsmooth.mesh.record import Labels, Mesh
     from jaxsmooth.methods import METHODS, Elastic, Laplacian, Method, Optimize
-    from jaxsmooth.metrics import METRICS, quality, quality_mean
-    from jaxsmooth.patches import PatchGuard
-    from jaxsmooth.runs import FixedPoint, fixed_point, run, step
-    from jaxsmooth.smoothing import SmoothResult, smooth, statistics
+    from jaxsmooth.methods.elastic.elasticity import Material
+    from jaxsmooth.metrics.summary import Statistics, statistics
+    from jaxsmooth.metrics.table import METRICS, quality, quality_mean
+    from jaxsmooth.motion.base import Motion
+    from jaxsmooth.motion.detect import detect_constraints
+    from jaxsmooth.motion.planar import Constraints
+    from jaxsmooth.runs.batch import Batch, stack
+    from jaxsmooth.runs.driver import SmoothResult, smooth
+    from jaxsmooth.runs.pure import FixedPoint, fixed_point, run, step
 
 
 def __getattr__(name: str):

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxsmooth import __version__
-from jaxsmooth.outputs import Outputs, ending
-from jaxsmooth.terminal import (
+from jaxsmooth.files.outputs import Outputs, ending
+from jaxsmooth.report.terminal import (
     close_standard_output,
     complain,
     prepare_streams,
@@ -25,8 +25,7 @@ from jaxsmooth.terminal import (
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from jaxsmooth.constraints import Constraints
-    from jaxsmooth.meshfile import MeshFile
+    from jaxsmooth.convert.meshfile import MeshFile
     from jaxsmooth.methods import Method
 
 __all__ = ["main"]
@@ -173,8 +172,8 @@ def _set_up_jax(precision: str) -> None:
 
 
 def _smooth(options: argparse.Namespace, outputs: Outputs) -> int:
-    from jaxsmooth import report
-    from jaxsmooth.io import check_types, output_format, read, write_to
+    from jaxsmooth.files.io import check_types, output_format, read, write_to
+    from jaxsmooth.report import report
 
     method = _method(options.method, options.goal)
     _check_before_smoothing(options)
@@ -189,7 +188,7 @@ def _smooth(options: argparse.Namespace, outputs: Outputs) -> int:
     _print_losses(out, notes, options.output)
     with clock("constraints"):
         constraints = _constraints(file, options)
-    report.print_constraints(out, constraints)
+    report.print_constraints(out, constraints, file.mesh)
     with clock("smooth"):
         result = _run(file, method, options.steps, constraints, lambda row: report.print_step(out, row))
     with clock("write"):
@@ -210,9 +209,9 @@ def _smooth(options: argparse.Namespace, outputs: Outputs) -> int:
 
 
 def _quality(options: argparse.Namespace, outputs: Outputs) -> int:
-    from jaxsmooth import report
-    from jaxsmooth.io import read
-    from jaxsmooth.metrics import METRICS, metric
+    from jaxsmooth.files.io import read
+    from jaxsmooth.metrics.table import METRICS, metric
+    from jaxsmooth.report import report
 
     names = options.metric or list(METRICS)
     for name in names:
@@ -231,9 +230,9 @@ def _quality(options: argparse.Namespace, outputs: Outputs) -> int:
 
 
 def _compare(options: argparse.Namespace, outputs: Outputs) -> int:
-    from jaxsmooth import report
-    from jaxsmooth.io import read
+    from jaxsmooth.files.io import read
     from jaxsmooth.methods import METHODS
+    from jaxsmooth.report import report
 
     names = list(METHODS) if options.methods is None else [n.strip() for n in options.methods.split(",")]
     if options.goal is not None and "optimize" not in names:
@@ -245,7 +244,7 @@ def _compare(options: argparse.Namespace, outputs: Outputs) -> int:
     file = read(options.input)
     report.print_file(out, file)
     constraints = _constraints(file, options)
-    report.print_constraints(out, constraints)
+    report.print_constraints(out, constraints, file.mesh)
     rows = [report.compare_row("input", file.mesh, None, constraints, {})]
     for name, method in methods.items():
         clock = report.Clock()
@@ -271,8 +270,8 @@ def _demo(options: argparse.Namespace, outputs: Outputs) -> int:
 
 
 def _check_before_smoothing(options: argparse.Namespace) -> None:
-    from jaxsmooth.files.formats import format_of_suffix
-    from jaxsmooth.io import check_output
+    from jaxsmooth.files.io import check_output
+    from jaxsmooth.files.reading import format_of_suffix
 
     _check_run_options(options)
     check_output(options.output, options.input, force=options.force)
@@ -281,7 +280,7 @@ def _check_before_smoothing(options: argparse.Namespace) -> None:
         raise ValueError("--report -: a report can't go to standard output; name a file")
     _check_side_files(options, OUT=options.output)
     if options.report is not None:
-        import jaxsmooth.pictures  # noqa: F401  it says what is missing
+        import jaxsmooth.report.pictures  # noqa: F401  it says what is missing
 
 
 def _check_run_options(options: argparse.Namespace) -> None:
@@ -296,7 +295,7 @@ def _check_run_options(options: argparse.Namespace) -> None:
 
 def _check_side_files(options: argparse.Namespace, **meshes: str) -> None:
     """Whether JSON and report can be written, and are neither a mesh nor one another."""
-    from jaxsmooth.io import check_distinct, check_output
+    from jaxsmooth.files.io import check_distinct, check_output
 
     sides = {"--json": options.json, "--report": getattr(options, "report", None)}
     sides = {name: path for name, path in sides.items() if path not in (None, "-")}
@@ -326,7 +325,7 @@ def _method(name: str, goal: str | None) -> Method:
 
 
 def _run(file: MeshFile, method: Method, steps: int | None, constraints: Constraints, callback: Any):
-    from jaxsmooth.smoothing import smooth
+    from jaxsmooth.runs.driver import smooth
 
     exactly = {} if steps is None else {"steps": steps, "tolerance_avg": 0.0}
     return smooth(file.mesh, method, constraints=constraints, callback=callback, **exactly)
@@ -335,7 +334,7 @@ def _run(file: MeshFile, method: Method, steps: int | None, constraints: Constra
 def _constraints(file: MeshFile, options: argparse.Namespace) -> Constraints:
     import difflib
 
-    from jaxsmooth.constraints import detect_constraints
+    from jaxsmooth.motion.detect import detect_constraints
 
     fixed = file.fixed.copy()
     for name in options.fix:
@@ -360,7 +359,7 @@ def _constraints(file: MeshFile, options: argparse.Namespace) -> Constraints:
 
 def _print_losses(out: Console, notes: Sequence[str], output: str) -> None:
     """What the output can't hold is said even to those who asked for silence."""
-    from jaxsmooth import report
+    from jaxsmooth.report import report
 
     report.print_notes(out, notes)
     for note in notes if out.quiet else ():

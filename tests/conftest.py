@@ -15,5 +15,4 @@ from jaxtyping import install_import_hook
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_disable_most_optimizations", True)
-CHECKED = ("elements", "small", "topology", "fitting", "metrics", "constraints")
-install_import_hook([f"jaxsmooth.{name}" for name in CHECKED], "runtime_types.check")
+install_import_hook("jaxsmooth", "runtime_types.check")

@@ -18,9 +18,9 @@ import numpy as np
 from meshes import KINDS, grid, hexahedra_and_pyramids, jiggle, mixed_2d, mixed_3d, rotation_matrix
 
 import jaxsmooth as js
-from jaxsmooth.elements import element_type
+from jaxsmooth.cells.table import element_type
 from jaxsmooth.methods import METHODS
-from jaxsmooth.validity import inverted
+from jaxsmooth.metrics.validity import inverted
 
 GUARDED = tuple(name for name in METHODS if name not in ("laplacian", "weighted-laplacian"))
 SHAPES = {

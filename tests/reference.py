@@ -6,7 +6,7 @@ It shares only the tabulated gradients and weights with jaxsmooth (`test_element
 import numpy as np
 import scipy.sparse as sp
 
-from jaxsmooth.elements import element_type
+from jaxsmooth.cells.table import element_type
 
 
 def elasticity_matrix(dim, young=1.0, nu=0.0):

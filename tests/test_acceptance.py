@@ -10,8 +10,9 @@ import pytest
 from meshes import grid, mixed_2d
 
 import jaxsmooth as js
-from jaxsmooth.acceptance import AcceptanceRule, Statistics, Status
-from jaxsmooth.validity import inverted
+from jaxsmooth.guards.acceptance import AcceptanceRule, Status
+from jaxsmooth.metrics.summary import Statistics
+from jaxsmooth.metrics.validity import inverted
 
 SHARED = Path(__file__).parents[2] / "shared"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="the shared meshes are not here")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import jaxsmooth as js
-from jaxsmooth.elements import element_type, supported
-from jaxsmooth.layers import aspect_ratios, boundary_layers, layer_nodes, nodes_of, stretched
-from jaxsmooth.mesh import Mesh
+from jaxsmooth.cells.table import element_type, supported
+from jaxsmooth.mesh.layers import aspect_ratios, boundary_layers, layer_nodes, nodes_of, stretched
+from jaxsmooth.mesh.record import Mesh
 
 SHARED = Path(__file__).parents[2] / "shared"
 

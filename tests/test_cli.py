@@ -163,7 +163,7 @@ def test_the_goal_reaches_the_method(part, tmp_path, monkeypatch):
         (smooth, "balanced"),
         (("compare", part, "--methods", "optimize, elastic", "--goal", "worst"), "worst"),
     ]:
-        (_, method), _ = arguments_of(monkeypatch, "jaxsmooth.smoothing.smooth", *command)
+        (_, method), _ = arguments_of(monkeypatch, "jaxsmooth.runs.driver.smooth", *command)
         assert method == js.Optimize(goal=goal)
     with pytest.raises(SystemExit) as end:
         run(*smooth, "--goal", "best")
@@ -171,7 +171,7 @@ def test_the_goal_reaches_the_method(part, tmp_path, monkeypatch):
 
 
 def test_freezing_reaches_the_constraints(part, tmp_path, monkeypatch):
-    detect = "jaxsmooth.constraints.detect_constraints"
+    detect = "jaxsmooth.motion.planar.detect_constraints"
     smooth = ("smooth", part, tmp_path / "out.vtu")
     assert "freeze_aspect" not in arguments_of(monkeypatch, detect, *smooth)[1]
     for command in (smooth, ("compare", part)):
@@ -253,7 +253,7 @@ def test_the_help_names_every_method():
 
 def test_the_help_says_the_defaults():
     from jaxsmooth.cli import _GOALS, _parser
-    from jaxsmooth.methods.optimize import GOALS
+    from jaxsmooth.methods.optimize.method import GOALS
 
     assert list(GOALS) == list(_GOALS)
     (commands,) = (a.choices for a in _parser()._actions if a.choices)

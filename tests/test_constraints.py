@@ -4,8 +4,10 @@ import meshes
 import numpy as np
 import pytest
 
-from jaxsmooth.constraints import Constraints, coordinate_error, detect_constraints
-from jaxsmooth.mesh import Labels, Mesh
+from jaxsmooth.mesh.record import Labels, Mesh
+from jaxsmooth.motion.detect import detect_constraints
+from jaxsmooth.motion.planar import Constraints
+from jaxsmooth.numerics.rounding import coordinate_error
 
 MIXED = {"mixed 2d": meshes.mixed_2d, "mixed 3d": meshes.mixed_3d}
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import jaxsmooth as js
-from jaxsmooth.elements import element_type
-from jaxsmooth.meshfile import MeshFileError, to_meshio
+from jaxsmooth.cells.table import element_type
+from jaxsmooth.convert.meshfile import MeshFileError, to_meshio
 
 CASES = Path(__file__).parents[2] / "shared" / "cases"
 

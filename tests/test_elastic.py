@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import reference
 
-from jaxsmooth import patches
-from jaxsmooth.constraints import Constraints, detect_constraints
-from jaxsmooth.mesh import Mesh
-from jaxsmooth.methods.elastic import Elastic
+from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.methods.elastic.method import Elastic
+from jaxsmooth.metrics import evaluation as patches
+from jaxsmooth.motion.detect import detect_constraints
+from jaxsmooth.motion.planar import Constraints
 
 evaluate = jax.jit(patches.evaluate)
 EXACT = Elastic(guard=None, tolerance=1e-12)

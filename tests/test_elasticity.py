@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import reference
 
-from jaxsmooth import elasticity
-from jaxsmooth.elasticity import (
-    ElementBlock,
+from jaxsmooth import assembly
+from jaxsmooth.cells.table import element_type
+from jaxsmooth.mesh.execution import Execution
+from jaxsmooth.methods.elastic import elasticity
+from jaxsmooth.methods.elastic.elasticity import (
     Material,
     Operator,
     element_force,
@@ -19,7 +21,6 @@ from jaxsmooth.elasticity import (
     node_blocks,
     stiffness,
 )
-from jaxsmooth.elements import element_type
 
 
 @pytest.fixture(scope="module", params=meshes.KINDS)
@@ -126,13 +127,13 @@ def test_flat_and_collapsed_elements_have_finite_stiffness():
         assert np.linalg.eigvalsh(k)[0] >= -1e-12 * np.abs(k).max()
 
 
-def operator(points, blocks, material):
+def operator(points, blocks, material, execution=None):
     cut = []
     for kind, nodes in blocks.items():
         row = element_type(kind)
         size = jnp.asarray([abs(reference.measure(kind, points[element])) for element in nodes])
         elements = jax.jit(jax.vmap(partial(linearise, row)))(points[nodes], size)
-        cut.append(ElementBlock.cut(jnp.asarray(nodes, jnp.int32), elements))
+        cut.append(assembly.cut(jnp.asarray(nodes, jnp.int32), elements, execution or Execution()))
     return Operator(tuple(cut), material)
 
 
@@ -145,10 +146,9 @@ MIXED = {
 
 @pytest.mark.parametrize("mesh", MIXED)
 @pytest.mark.parametrize("chunk", [4096, 3])
-def test_operator_equals_the_assembled_matrix(mesh, chunk, monkeypatch):
-    monkeypatch.setattr(elasticity, "_CPU_CHUNK", chunk)
+def test_operator_equals_the_assembled_matrix(mesh, chunk):
     points, blocks = MIXED[mesh]()
-    found = operator(points, blocks, Material(2.0, 0.3))
+    found = operator(points, blocks, Material(2.0, 0.3), Execution(chunk))
     if chunk == 3:
         assert (
             max(block.nodes.shape[0] for block in found.blocks) > 2

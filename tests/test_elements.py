@@ -7,7 +7,7 @@ import meshes
 import numpy as np
 import pytest
 
-from jaxsmooth.elements import TYPES, element_type, supported
+from jaxsmooth.cells.table import TYPES, element_type, supported
 
 KINDS = meshes.KINDS
 QUADRATIC = [k for k in KINDS if k != meshes.LINEAR[k]]

@@ -7,8 +7,8 @@ import meshio
 import numpy as np
 import pytest
 
-from jaxsmooth.io import MeshFileError, read, write
-from jaxsmooth.meshfile import from_meshio
+from jaxsmooth.convert.meshfile import from_meshio
+from jaxsmooth.files.io import MeshFileError, read, write
 
 
 @pytest.fixture(autouse=True)

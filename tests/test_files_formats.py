@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from test_files_damage import FORMATS, content, plane, solid
 
-from jaxsmooth.files.exports import check_types, check_writable
-from jaxsmooth.io import MeshFileError, read, write
-from jaxsmooth.meshfile import from_meshio
+from jaxsmooth.convert.meshfile import from_meshio
+from jaxsmooth.files.io import MeshFileError, read, write
+from jaxsmooth.files.writing import check_types, check_writable
 
 DATA = Path(__file__).parent / "data"
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import jaxsmooth as js
-from jaxsmooth.io import MeshFileError, read, write
-from jaxsmooth.meshfile import from_meshio
+from jaxsmooth.convert.meshfile import from_meshio
+from jaxsmooth.files.io import MeshFileError, read, write
 
 DATA = Path(__file__).parent / "data"
 needs_netcdf = pytest.mark.skipif(importlib.util.find_spec("netCDF4") is None, reason="needs netCDF4")

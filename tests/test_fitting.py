@@ -10,8 +10,9 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from jaxsmooth.elements import element_type
-from jaxsmooth.fitting import fit, rotation, rotation_svd, target_element
+from jaxsmooth.cells.table import element_type
+from jaxsmooth.methods.elastic.fitting import fit, target_element
+from jaxsmooth.numerics.rotation import rotation, rotation_svd
 
 COUNT = 40  # all batches have this size, so that everything compiles once a dimension and dtype
 

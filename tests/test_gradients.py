@@ -10,11 +10,11 @@ from derivatives import check, objective
 from meshes import KINDS, grid, ideal, rotation_matrix
 
 import jaxsmooth as js
-from jaxsmooth.elasticity import Material, element_force, linearise
-from jaxsmooth.elements import element_type
-from jaxsmooth.fitting import target_element
-from jaxsmooth.metrics import measure, shape_quality
-from jaxsmooth.patches import evaluate
+from jaxsmooth.cells.table import element_type
+from jaxsmooth.methods.elastic.elasticity import Material, element_force, linearise
+from jaxsmooth.methods.elastic.fitting import target_element
+from jaxsmooth.metrics.evaluation import evaluate
+from jaxsmooth.metrics.table import measure, shape_quality
 
 SHARED = Path(__file__).parents[2] / "shared" / "meshes"
 EXACT = 1e-13  # of the linear systems, where differences are taken

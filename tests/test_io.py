@@ -11,11 +11,11 @@ import meshio
 import numpy as np
 import pytest
 
-import jaxsmooth.io as jsio
-from jaxsmooth.elements import element_type, supported
-from jaxsmooth.files.exodus import EXODUS_ORDER, extend_exodus
-from jaxsmooth.io import MeshFileError, check_output, read, write
-from jaxsmooth.meshfile import from_meshio
+import jaxsmooth.files.io as jsio
+from jaxsmooth.cells.table import element_type, supported
+from jaxsmooth.convert.meshfile import from_meshio
+from jaxsmooth.files.formats.exodus import EXODUS_ORDER, extend_exodus
+from jaxsmooth.files.io import MeshFileError, check_output, read, write
 
 needs_h5py = pytest.mark.skipif(importlib.util.find_spec("h5py") is None, reason="needs h5py")
 needs_netcdf = pytest.mark.skipif(importlib.util.find_spec("netCDF4") is None, reason="needs netCDF4")

@@ -8,11 +8,12 @@ import meshes
 import numpy as np
 import pytest
 
-from jaxsmooth.constraints import Constraints, detect_constraints
-from jaxsmooth.mesh import Mesh
+from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.methods import METHODS, Elastic, Laplacian
-from jaxsmooth.patches import evaluate
-from jaxsmooth.smoothing import smooth
+from jaxsmooth.metrics.evaluation import evaluate
+from jaxsmooth.motion.detect import detect_constraints
+from jaxsmooth.motion.planar import Constraints
+from jaxsmooth.runs.driver import smooth
 
 EXACT = 1e-12  # float64, meshes of unit size
 evaluated = jax.jit(evaluate)

@@ -7,10 +7,10 @@ import meshio
 import numpy as np
 import pytest
 
-from jaxsmooth.elements import TYPES, element_type, supported
-from jaxsmooth.mesh import Mesh
-from jaxsmooth.meshfile import MeshFileError, as_mesh, from_meshio, to_meshio
-from jaxsmooth.orientation import orient
+from jaxsmooth.cells.table import TYPES, element_type, supported
+from jaxsmooth.convert.meshfile import MeshFileError, as_mesh, from_meshio, to_meshio
+from jaxsmooth.mesh.orientation import orient
+from jaxsmooth.mesh.record import Mesh
 
 MESHES = Path(__file__).parents[2] / "shared" / "meshes"
 

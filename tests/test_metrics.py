@@ -12,10 +12,10 @@ import pytest
 from scipy.integrate import quad as integrate
 from scipy.spatial import ConvexHull
 
-from jaxsmooth.elements import element_type
-from jaxsmooth.mesh import Mesh
-from jaxsmooth.metrics import METRICS, metric, quality, quality_mean, surface
-from jaxsmooth.small import least
+from jaxsmooth.cells.table import element_type
+from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.metrics.table import METRICS, metric, quality, quality_mean, surface
+from jaxsmooth.numerics.small import least
 
 KINDS = meshes.KINDS
 TABLE = json.loads((Path(__file__).parent / "data" / "quality_tables.json").read_text())["elements"]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxsmooth.outputs import Outputs, ending
+from jaxsmooth.files.outputs import Outputs, ending
 
 SPACING = int(os.environ.get("JAXSMOOTH_LINES", "13"))  # 1: at every line, one minute
 

@@ -10,8 +10,8 @@ from benchmarks.paper import tables
 from benchmarks.paper.__main__ import main
 from benchmarks.paper.examples import EXAMPLES, quality_values, run, runnable
 from benchmarks.paper.printed import ELEMENTS, EVOLUTION
-from jaxsmooth.constraints import detect_constraints
-from jaxsmooth.mesh import Mesh
+from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.motion.detect import detect_constraints
 
 BUILT = {key: Mesh(*EXAMPLES[key].build()) for key in EXAMPLES if not EXAMPLES[key].needs_gmsh}
 

@@ -6,9 +6,11 @@ import meshes
 import numpy as np
 import pytest
 
-from jaxsmooth import patches
-from jaxsmooth.mesh import Mesh
-from jaxsmooth.patches import PatchGuard, patch_mean, patch_min
+from jaxsmooth.assembly import patch_mean, patch_min
+from jaxsmooth.guards.patch import PatchGuard
+from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.metrics import evaluation as patches
+from jaxsmooth.motion.planar import Constraints
 
 GUARD = PatchGuard()
 evaluate = jax.jit(patches.evaluate)
@@ -16,7 +18,7 @@ evaluate = jax.jit(patches.evaluate)
 
 @jax.jit
 def guarded(guard, mesh, move):
-    return guard(mesh, move, patches.evaluate(mesh))
+    return guard(mesh, Constraints.hold(mesh, []), move, patches.evaluate(mesh))
 
 
 MESHES = {

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import jaxsmooth as js
-from jaxsmooth.meshfile import MeshFileError, to_meshio
-from jaxsmooth.planes import find_plane
+from jaxsmooth.convert.meshfile import MeshFileError, to_meshio
+from jaxsmooth.convert.planes import find_plane
 
 CASES = Path(__file__).parents[2] / "shared" / "cases"
 FLAT, BLOCKS = meshes.grid("triangle", (5, 5), 0.12)

@@ -18,11 +18,11 @@ from jax.errors import JaxRuntimeError
 from meshes import grid
 
 import jaxsmooth as js
-from jaxsmooth import report as reports
-from jaxsmooth import smoothing
 from jaxsmooth.cli import main
+from jaxsmooth.convert.meshfile import MeshFileError
 from jaxsmooth.files import exports
-from jaxsmooth.meshfile import MeshFileError
+from jaxsmooth.report import report as reports
+from jaxsmooth.runs import driver as smoothing
 
 
 def run(*arguments):
@@ -57,7 +57,7 @@ def no_work(monkeypatch):
     def fail(*args, **kwargs):
         raise AssertionError("the work has begun")
 
-    monkeypatch.setattr("jaxsmooth.io.read", fail)
+    monkeypatch.setattr("jaxsmooth.files.io.read", fail)
     monkeypatch.setattr(smoothing, "smooth", fail)
 
 
@@ -173,7 +173,7 @@ def test_a_read_only_file_system(part, out, no_work, capsys, monkeypatch):
 
 @pytest.fixture
 def no_matplotlib(monkeypatch):
-    monkeypatch.delitem(sys.modules, "jaxsmooth.pictures", raising=False)
+    monkeypatch.delitem(sys.modules, "jaxsmooth.report.pictures", raising=False)
     monkeypatch.setitem(sys.modules, "matplotlib.axes", None)
 
 
@@ -190,7 +190,7 @@ def test_what_a_format_needs_is_asked_before_the_work(part, out, capsys, monkeyp
     def fail(*args, **kwargs):
         raise AssertionError("the work has begun")
 
-    monkeypatch.setattr("jaxsmooth.io.check_types", lacking)
+    monkeypatch.setattr("jaxsmooth.files.io.check_types", lacking)
     monkeypatch.setattr(smoothing, "smooth", fail)
     assert run("smooth", part, out / "a.med") == 2
     one_sentence(capsys, "needs h5py")
@@ -281,11 +281,11 @@ def test_a_full_disk(part, out, capsys):
 
 
 STAGES = {
-    "reading": ("jaxsmooth.io.read", False),
-    "smoothing": ("jaxsmooth.report.print_step", False),
+    "reading": ("jaxsmooth.files.io.read", False),
+    "smoothing": ("jaxsmooth.report.report.print_step", False),
     "writing the mesh": ("meshio.write", False),
-    "making the report": ("jaxsmooth.report.html_page", False),
-    "printing the table": ("jaxsmooth.report.print_comparison", False),
+    "making the report": ("jaxsmooth.report.report.html_page", False),
+    "printing the table": ("jaxsmooth.report.report.print_comparison", False),
     "saying so": ("jaxsmooth.cli._finish", True),
 }
 
@@ -316,7 +316,7 @@ def test_interrupts(stage, part, out, capsys, monkeypatch):
 
 PROGRAM = """
 import gc, signal, sys
-import jaxsmooth.report, jaxsmooth.io
+import jaxsmooth.report.report, jaxsmooth.files.io
 from jaxsmooth.cli import main
 
 def interrupt(*args):
@@ -328,7 +328,7 @@ def page(*args):
     gc.collect()
     return ""
 
-jaxsmooth.report.html_page = page
+jaxsmooth.report.report.html_page = page
 sys.exit(main())
 """
 
@@ -346,12 +346,12 @@ def test_interrupts_that_callbacks_would_swallow(part, out):
 @pytest.mark.parametrize(
     ("name", "error"),
     [
-        ("jaxsmooth.smoothing.smooth", MemoryError()),
+        ("jaxsmooth.runs.driver.smooth", MemoryError()),
         (
-            "jaxsmooth.smoothing.smooth",
+            "jaxsmooth.runs.driver.smooth",
             JaxRuntimeError("RESOURCE_EXHAUSTED: allocating 9 bytes."),
         ),
-        ("jaxsmooth.smoothing.smooth", JaxRuntimeError("INTERNAL: std::bad_alloc")),
+        ("jaxsmooth.runs.driver.smooth", JaxRuntimeError("INTERNAL: std::bad_alloc")),
         ("meshio.write", np._core._exceptions._ArrayMemoryError((9,), np.dtype(float))),
         ("meshio.vtu.read", MemoryError()),
     ],
@@ -368,7 +368,7 @@ def test_out_of_memory(name, error, part, out, capsys, monkeypatch):
 
 def test_errors_of_the_program_keep_their_traceback(part, out, monkeypatch):
     monkeypatch.setattr(exports, "write_source", raising(TypeError("a bug")))
-    monkeypatch.setattr("jaxsmooth.io.write_source", raising(TypeError("a bug")))
+    monkeypatch.setattr("jaxsmooth.files.io.write_source", raising(TypeError("a bug")))
     with pytest.raises(TypeError, match="a bug"):
         smooth_three(part, out)
     assert list(out.iterdir()) == []
@@ -507,7 +507,7 @@ def test_the_demo_without_matplotlib(part, tmp_path, no_matplotlib, capsys, monk
 
 
 def test_a_demo_that_ends_early_leaves_nothing(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("jaxsmooth.report.print_step", raising(KeyboardInterrupt()))
+    monkeypatch.setattr("jaxsmooth.report.report.print_step", raising(KeyboardInterrupt()))
     assert run("demo", tmp_path / "a" / "demo") == 130
     assert "nothing was written" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 import reference
 
-from jaxsmooth.constraints import Constraints, detect_constraints
-from jaxsmooth.elasticity import Material
-from jaxsmooth.mesh import Mesh
-from jaxsmooth.methods.elastic import Elastic
-from jaxsmooth.patches import evaluate
-from jaxsmooth.solve import block_inverse, solve_projected
+from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.methods.elastic.elasticity import Material
+from jaxsmooth.methods.elastic.method import Elastic
+from jaxsmooth.metrics.evaluation import evaluate
+from jaxsmooth.motion.detect import detect_constraints
+from jaxsmooth.motion.planar import Constraints
+from jaxsmooth.numerics.admissible import Admissible
+from jaxsmooth.numerics.solve import block_inverse, solve_projected
 
 
 def inclined(kind, seed=0):
@@ -100,7 +102,7 @@ jax.tree_util.register_pytree_node(Dense, lambda op: ((op.k,), None), lambda _, 
 @jax.jit
 def dense_solve(k, projectors, force, tolerance=1e-13):
     diagonal = jnp.einsum("ninj->nij", k.reshape(6, 2, 6, 2))
-    return solve_projected(Dense(k), diagonal, projectors, force, tolerance, 200)
+    return solve_projected(Dense(k), diagonal, Admissible(projectors), force, tolerance, 200)
 
 
 def exact(k, projectors, force):
@@ -135,7 +137,7 @@ def test_running_out_of_iterations_is_reported():
     k, projectors, force = dense_problem()
     diagonal = jnp.einsum("ninj->nij", jnp.asarray(k).reshape(6, 2, 6, 2))
     found = solve_projected(
-        Dense(jnp.asarray(k)), diagonal, jnp.asarray(projectors), jnp.asarray(force), 1e-13, 3
+        Dense(jnp.asarray(k)), diagonal, Admissible(jnp.asarray(projectors)), jnp.asarray(force), 1e-13, 3
     )
     assert int(found.iterations) == 3
     assert float(found.residual) > 1e-3
@@ -154,7 +156,7 @@ def test_a_singular_system_ends():
     def pulled(force, cotangent):
         k = jnp.asarray(stiffness)
         diagonal = jnp.einsum("ninj->nij", k.reshape(len(points), 2, len(points), 2))
-        solve = lambda f: solve_projected(Dense(k), diagonal, free.projectors, f, 1e-2, 1000)  # noqa: E731
+        solve = lambda f: solve_projected(Dense(k), diagonal, Admissible(free.projectors), f, 1e-2, 1000)  # noqa: E731
         found = solve(cotangent)
         return found.iterations, jax.vjp(lambda f: solve(f).field, force)[1](cotangent)[0]
 
@@ -171,13 +173,15 @@ def test_block_inverse():
     blocks[3] = 0
     projectors = np.tile(np.eye(3), (5, 1, 1))
     projectors[4] = np.diag([1, 1, 0])
-    found = np.asarray(block_inverse(jnp.asarray(blocks), jnp.asarray(projectors)))
+    found = np.asarray(block_inverse(jnp.asarray(blocks), Admissible(jnp.asarray(projectors))))
     for n in (0, 1, 2):
         np.testing.assert_allclose(found[n] @ blocks[n], np.eye(3), atol=1e-9)
     np.testing.assert_array_equal(found[3], np.eye(3))
     np.testing.assert_allclose(found[4][:2, :2] @ blocks[4][:2, :2], np.eye(2), atol=1e-12)
     # the size of a block, not that of 1, decides what is singular: in nanometres nothing changes
-    small = np.asarray(block_inverse(jnp.asarray(blocks[4:] * 2.0**-90), jnp.asarray(projectors[4:])))
+    small = np.asarray(
+        block_inverse(jnp.asarray(blocks[4:] * 2.0**-90), Admissible(jnp.asarray(projectors[4:])))
+    )
     np.testing.assert_allclose(small[0] * 2.0**-90, found[4], rtol=1e-13)
 
 

@@ -19,9 +19,9 @@ from meshes import (
 )
 
 import jaxsmooth as js
-from jaxsmooth.bernstein import bernstein
-from jaxsmooth.elements import element_type
-from jaxsmooth.validity import determinant_bound, inverted
+from jaxsmooth.cells.bernstein import bernstein
+from jaxsmooth.cells.table import element_type
+from jaxsmooth.metrics.validity import determinant_bound, inverted
 
 COUNT = 120  # random elements a type; everywhere the same, so that compiled functions are shared
 

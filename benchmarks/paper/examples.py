@@ -11,12 +11,12 @@ import numpy as np
 
 from benchmarks.paper import meshes
 from benchmarks.paper.macro import concave_solid
-from jaxsmooth.acceptance import AcceptanceRule
-from jaxsmooth.constraints import detect_constraints
-from jaxsmooth.mesh import Mesh
+from jaxsmooth.guards.acceptance import AcceptanceRule
+from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.methods import METHODS
-from jaxsmooth.patches import evaluate
-from jaxsmooth.smoothing import StepRecord, smooth
+from jaxsmooth.metrics.evaluation import evaluate
+from jaxsmooth.motion.detect import detect_constraints
+from jaxsmooth.runs.driver import StepRecord, smooth
 
 __all__ = ["EXAMPLES", "Example", "Outcome", "quality_values", "run", "runnable"]
 

@@ -15,12 +15,13 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 
 from benchmarks.paper.examples import Outcome, quality_values
-from jaxsmooth.constraints import detect_constraints
-from jaxsmooth.elasticity import Material, element_force, linearise
-from jaxsmooth.elements import ElementType
-from jaxsmooth.fitting import target_element
-from jaxsmooth.mesh import Mesh, gather, scatter_add
-from jaxsmooth.methods.elastic import target_measures
+from jaxsmooth.assembly import gather, scatter_add
+from jaxsmooth.cells.table import ElementType
+from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.methods.elastic.elasticity import Material, element_force, linearise
+from jaxsmooth.methods.elastic.fitting import target_element
+from jaxsmooth.methods.elastic.method import target_measures
+from jaxsmooth.motion.detect import detect_constraints
 
 __all__ = ["box_plot", "draw", "forces", "histogram", "mesh_row", "paper_figures"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxsmooth.elements import element_type
+from jaxsmooth.cells.table import element_type
 
 __all__ = ["concave_solid"]
 

@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import Delaunay
 
-from jaxsmooth.elements import element_type
+from jaxsmooth.cells.table import element_type
 
 __all__ = [
     "distort",

@@ -99,7 +99,7 @@ SHAPES: dict[str, dict[str, tuple[tuple[float, ...], ...]]] = {
     },
 }
 
-# Tables 1 and 2, the rows that `jaxsmooth.metrics.METRICS` has: type, row, metric, columns a to d.
+# Tables 1 and 2, the rows that `jaxsmooth.metrics.table.METRICS` has: type, row, metric, columns a to d.
 # For triangles and tetrahedra the mean ratio is Lo's and Liu and Joe's formula.
 METRIC_ROWS = (
     ("triangle", "Proposed", "shape", (1.000, 0.892, 0.578, 0.193)),

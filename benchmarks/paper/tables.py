@@ -11,9 +11,9 @@ import numpy as np
 
 from benchmarks.paper.examples import Outcome
 from benchmarks.paper.printed import COMPARISON, ELEMENTS, EVOLUTION, METRIC_ROWS, SHAPES
-from jaxsmooth.elements import element_type
-from jaxsmooth.mesh import Mesh
-from jaxsmooth.metrics import quality
+from jaxsmooth.cells.table import element_type
+from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.metrics.table import quality
 
 __all__ = ["Table", "comparison", "evolution", "metrics", "timing", "write_csv"]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from jaxsmooth.outputs import Outputs
+    from jaxsmooth.files.outputs import Outputs
 
 __all__ = ["MESH", "run"]
 
@@ -19,16 +19,16 @@ def run(directory: Path, outputs: Outputs) -> None:
 
     The files are committed to `outputs`; without matplotlib a line says what is missing.
     """
-    from jaxsmooth import report
-    from jaxsmooth.io import check_output, read, write_to
-    from jaxsmooth.meshfile import as_mesh
+    from jaxsmooth.convert.meshfile import as_mesh
+    from jaxsmooth.files.io import check_output, read, write_to
     from jaxsmooth.methods import Elastic
-    from jaxsmooth.smoothing import smooth
+    from jaxsmooth.report import report
+    from jaxsmooth.runs.driver import smooth
 
     out = report.console()
     names = ["bracket-smooth.vtu"]
     try:
-        from jaxsmooth.pictures import before_after
+        from jaxsmooth.report.pictures import before_after
     except ImportError as missing:
         out.print(f"neither picture nor report: {missing}", style="yellow")
     else:
@@ -40,7 +40,7 @@ def run(directory: Path, outputs: Outputs) -> None:
     file = read(MESH)
     report.print_file(out, file)
     result = smooth(file, Elastic(extended=True), callback=lambda row: report.print_step(out, row))
-    report.print_constraints(out, result.constraints)
+    report.print_constraints(out, result.constraints, result.mesh)
     write_to(outputs, mesh_path, file, result, cell_data={"quality": result.quality})
     before = as_mesh(file)
     if picture_paths:

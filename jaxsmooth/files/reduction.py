@@ -5,8 +5,8 @@ from __future__ import annotations
 import meshio
 import numpy as np
 
-from jaxsmooth.files.labels import is_mask
-from jaxsmooth.files.regions import (
+from jaxsmooth.convert.labels import is_mask
+from jaxsmooth.convert.regions import (
     NOT_SETS,
     REGION_NAMES,
     SECTIONS,

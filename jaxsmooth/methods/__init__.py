@@ -4,9 +4,9 @@ from collections.abc import Callable
 from functools import partial
 
 from jaxsmooth.methods.base import Method, Proposal, Step
-from jaxsmooth.methods.elastic import Elastic
+from jaxsmooth.methods.elastic.method import Elastic
 from jaxsmooth.methods.laplacian import Laplacian
-from jaxsmooth.methods.optimize import Optimize
+from jaxsmooth.methods.optimize.method import Optimize
 
 __all__ = ["METHODS", "Elastic", "Laplacian", "Method", "Optimize", "Proposal", "Step"]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -11,10 +10,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxsmooth.acceptance import AcceptanceRule
-from jaxsmooth.constraints import Constraints
-from jaxsmooth.mesh import Mesh
-from jaxsmooth.patches import Evaluation, Guarded, PatchGuard, evaluate
+from jaxsmooth.guards.acceptance import AcceptanceRule
+from jaxsmooth.guards.base import Guard
+from jaxsmooth.guards.patch import PatchGuard
+from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.metrics.evaluation import Evaluation, evaluate
+from jaxsmooth.motion.base import Motion
 
 __all__ = ["Method", "Proposal", "Step"]
 
@@ -46,7 +47,7 @@ class Method(eqx.Module):
     A new method is a subclass with `propose`, and a line in the table of methods.
     """
 
-    guard: eqx.AbstractVar[Callable[..., Guarded] | None]
+    guard: eqx.AbstractVar[Guard | None]
 
     def prepare(self, mesh: Mesh) -> Method:
         """Host-side work on the topology, done once before the first step; by default none."""
@@ -79,16 +80,16 @@ class Method(eqx.Module):
         return eqx.tree_at(lambda method: method.guard, self, replace(self.guard, **numbers))
 
     @abc.abstractmethod
-    def propose(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Proposal:
+    def propose(self, mesh: Mesh, motion: Motion, before: Evaluation) -> Proposal:
         """A displacement of all nodes within the constraints."""
 
-    def step(self, mesh: Mesh, constraints: Constraints, before: Evaluation) -> Step:
+    def step(self, mesh: Mesh, motion: Motion, before: Evaluation) -> Step:
         """Propose and guard: pure, jittable and differentiable in points and parameters."""
-        proposal = self.propose(mesh, constraints, before)
+        proposal = self.propose(mesh, motion, before)
         if self.guard is None:
-            points, after = mesh.points + proposal.move, None
+            points = motion.retract(mesh.points, proposal.move)
             after = evaluate(mesh.with_points(points))
             shortened = jnp.int32(0)
         else:
-            points, after, shortened, _ = self.guard(mesh, proposal.move, before)
+            points, after, shortened, _ = self.guard(mesh, motion, proposal.move, before)
         return Step(points, after, proposal.iterations, proposal.residual, shortened)

@@ -1,0 +1,107 @@
+"""Exodus files: names and node orders that meshio (5.3.5) gets wrong, and element blocks as materials."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import meshio
+import numpy as np
+
+from jaxsmooth.cells.table import element_type
+
+__all__ = ["EXODUS_BLOCKS", "EXODUS_ORDER", "extend_exodus", "read_exodus", "write_exodus"]
+
+
+def read_exodus(path: Path) -> meshio.Mesh:
+    """An Exodus file; its element blocks are materials.
+
+    Exodus has its own order of mid-side nodes; meshio leaves it, and writes VTK's.  Files of both kinds
+    exist, so the nodes' places decide."""
+    extend_exodus()
+    mesh = meshio.read(path, file_format="exodus")
+    mesh.points = np.ma.filled(mesh.points, np.nan)
+    for k, cells in enumerate(mesh.cells):
+        order = EXODUS_ORDER.get(cells.type)
+        if order is None or not len(cells):
+            continue
+        nodes = np.ma.filled(cells.data, -1)
+        turned = nodes[:, np.argsort(order)]
+        if _bend(mesh.points, turned, cells.type) < _bend(mesh.points, nodes, cells.type):
+            mesh.cells[k] = meshio.CellBlock(cells.type, turned)
+    numbers = [np.full(len(cells), k + 1) for k, cells in enumerate(mesh.cells)]
+    mesh.cell_data.setdefault(EXODUS_BLOCKS, numbers)
+    return mesh
+
+
+def write_exodus(path: Path, mesh: meshio.Mesh, name: str | None) -> None:
+    """Write a mesh; `name` is that of its material tags, or None.
+
+    Cells of one type and one material are one block.  The tags are an element variable, too: a material
+    with elements of two types is two blocks."""
+    import netCDF4
+
+    extend_exodus()
+    tags = mesh.cell_data[name] if name else [np.zeros(len(cells), np.int64) for cells in mesh.cells]
+    blocks, values = [], []
+    for kind in dict.fromkeys(cells.type for cells in mesh.cells):
+        own = [k for k, cells in enumerate(mesh.cells) if cells.type == kind]
+        nodes = np.concatenate([mesh.cells[k].data for k in own])
+        nodes = nodes[:, EXODUS_ORDER[kind]] if kind in EXODUS_ORDER else nodes
+        tag = np.concatenate([tags[k] for k in own])
+        for value in dict.fromkeys(tag.tolist()):
+            blocks.append(meshio.CellBlock(kind, nodes[tag == value]))
+            values.append(value)
+    plain = meshio.Mesh(mesh.points, blocks, point_data=mesh.point_data, point_sets=mesh.point_sets)
+    meshio.write(path, plain, file_format="exodus")
+    if name is None:
+        return
+    with netCDF4.Dataset(path, "a") as out:
+        out.createDimension("num_elem_var", 1)
+        names = out.createVariable("name_elem_var", "S1", ("num_elem_var", "len_string"))
+        names.set_auto_mask(False)
+        for i, letter in enumerate(name[:32]):
+            names[0, i] = letter.encode()
+        for k, (cells, value) in enumerate(zip(blocks, values, strict=True)):
+            variable = out.createVariable(
+                f"vals_elem_var1eb{k + 1}", "f8", ("time_step", f"num_el_in_blk{k + 1}")
+            )
+            variable[0] = np.full(len(cells), float(value))
+
+
+def extend_exodus() -> None:
+    """Add the names of Exodus types that meshio's tables lack, replacing none."""
+    from meshio.exodus import _exodus
+
+    for name, kind in _EXODUS_NAMES.items():
+        _exodus.exodus_to_meshio_type.setdefault(name, kind)
+        _exodus.meshio_to_exodus_type.setdefault(kind, name)
+
+
+def _bend(points: np.ndarray, nodes: np.ndarray, name: str) -> float:
+    """Mean distance of nodes from where straight elements have them."""
+    kind = element_type(name)
+    linear = element_type(kind.name.rstrip("0123456789"))
+    shape = linear.shape_functions(kind.natural)
+    straight = np.einsum("ac,ecd->ead", shape, points[nodes[:, : linear.k]])
+    return float(np.linalg.norm(points[nodes] - straight, axis=-1).mean())
+
+
+_HEX20 = [*range(12), 16, 17, 18, 19, 12, 13, 14, 15]
+EXODUS_ORDER = {
+    "wedge15": [*range(9), 12, 13, 14, 9, 10, 11],
+    "hexahedron20": _HEX20,
+    "hexahedron27": [*_HEX20, 26, 24, 25, 20, 21, 22, 23],
+}
+"""Nodes of VTK's element in Exodus' order."""
+
+EXODUS_BLOCKS = "ElementBlockIds"
+
+_EXODUS_NAMES = {
+    "HEX8": "hexahedron",
+    "TET": "tetra",
+    "TET10": "tetra10",
+    "PYRAMID5": "pyramid",
+    "PYRAMID13": "pyramid13",
+    "WEDGE6": "wedge",
+    "WEDGE15": "wedge15",
+}

@@ -1,0 +1,59 @@
+"""XDMF files with mixed topologies, of which meshio (5.3.5) knows linear types only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree
+
+import meshio
+import numpy as np
+
+from jaxsmooth.cells.table import TYPES, element_type
+
+__all__ = ["read_xdmf"]
+
+
+def read_xdmf(path: Path) -> meshio.Mesh:
+    """An XDMF file; mixed topologies are taken apart before meshio reads it."""
+    from meshio.xdmf.common import meshio_to_xdmf_type, xdmf_idx_to_meshio_type
+    from meshio.xdmf.main import XdmfReader
+
+    root = ElementTree.parse(path).getroot()
+    reader = XdmfReader(str(path))
+    for grid in root.iter("Grid"):
+        for topology in grid.findall("Topology"):
+            kind = topology.get("Type", topology.get("TopologyType"))
+            if kind != "Mixed":
+                continue
+            numbers = reader._read_data_item(topology[0], root)
+            at = list(grid).index(topology)
+            grid.remove(topology)
+            for code, nodes in _split_mixed(np.asarray(numbers).ravel(), xdmf_idx_to_meshio_type):
+                part = ElementTree.Element("Topology", Type=meshio_to_xdmf_type[code][0])
+                size = f"{nodes.shape[0]} {nodes.shape[1]}"
+                item = ElementTree.SubElement(
+                    part, "DataItem", DataType="Int", Precision="8", Dimensions=size, Format="XML"
+                )
+                item.text = " ".join(map(str, nodes.ravel().tolist()))
+                grid.insert(at, part)
+                at += 1
+    version = root.attrib.get("Version", "3")
+    read = reader.read_xdmf2 if version.startswith("2") else reader.read_xdmf3
+    return read(root)
+
+
+def _split_mixed(numbers: np.ndarray, types: dict[int, str]) -> Iterator[tuple[str, np.ndarray]]:
+    """Runs of cells of one type; points and lines have their node count behind the type."""
+    at = 0
+    while at < len(numbers):
+        code = int(numbers[at])
+        name = types.get(code)
+        if name != "vertex" and name not in TYPES:
+            raise ValueError(f"cells of XDMF type {code} are not supported")
+        skip = 2 if code in (1, 2) else 1
+        width = skip + (1 if name == "vertex" else element_type(name).k)
+        other = np.flatnonzero(numbers[at::width] != code)
+        end = at + width * int(other[0]) if len(other) else len(numbers)
+        yield name, numbers[at:end].reshape(-1, width)[:, skip:]
+        at = end

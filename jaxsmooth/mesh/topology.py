@@ -1,0 +1,121 @@
+"""What follows from connectivity, found once on the host with NumPy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxsmooth.cells.table import ElementType, element_type
+from jaxsmooth.mesh.record import Mesh
+
+__all__ = ["Facets", "facet_keys", "find_facets", "lengths", "node_pairs", "pair_codes", "signed_measures"]
+
+
+@dataclass(frozen=True)
+class Facets:
+    """The facets of one facet type, one row for every side of an element.
+
+    Attributes:
+        type: the facet's element type (`line`, `triangle`, …).
+        nodes: ``[facets, kf]``, outward from the element they belong to.
+        region: region of that element ``[facets]`` (0 where the mesh has no labels).
+        partner: region on the other side ``[facets]``; −1 on the boundary.
+    """
+
+    type: ElementType
+    nodes: np.ndarray
+    region: np.ndarray
+    partner: np.ndarray
+
+    def select(self, chosen: np.ndarray) -> Facets:
+        """The facets of a mask ``[facets]``."""
+        return Facets(self.type, self.nodes[chosen], self.region[chosen], self.partner[chosen])
+
+
+def find_facets(mesh: Mesh) -> list[Facets]:
+    """All facets of a mesh, with the region on either side.
+
+    Two elements share a facet when they share its corner nodes.  Boundary facets have
+    ``partner == -1``.
+    """
+    owners: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+    for (kind, nodes), region in zip(mesh.blocks, _regions(mesh), strict=True):
+        nodes = np.asarray(nodes)
+        for group in kind.facets:
+            sides = nodes[:, group.nodes].reshape(-1, group.nodes.shape[1])
+            owners.setdefault(group.type.name, []).append((sides, np.repeat(region, len(group.nodes))))
+    found = []
+    for name, parts in owners.items():
+        kind = element_type(name)
+        nodes = np.concatenate([p[0] for p in parts])
+        region = np.concatenate([p[1] for p in parts])
+        found.append([kind, nodes, region])
+    # A quadratic element may meet a linear one: corners decide, whatever the facet type.
+    corners = [_three_corners(nodes[:, : kind.corners]) for kind, nodes, _ in found]
+    keys = facet_keys(np.concatenate(corners), len(mesh.points))
+    regions = np.concatenate([region for _, _, region in found])
+    partner = _pair(keys, regions)
+    ends = np.cumsum([len(nodes) for _, nodes, _ in found])
+    return [
+        Facets(kind, nodes, region, other)
+        for (kind, nodes, region), other in zip(found, np.split(partner, ends[:-1]), strict=True)
+    ]
+
+
+def facet_keys(corners: np.ndarray, count: int) -> np.ndarray:
+    """One integer for every set of corner nodes ``[facets, c]`` of a mesh of `count` nodes."""
+    ordered = _three_corners(corners).astype(np.int64)
+    if count < 2**21:
+        base = np.int64(count)
+        return ordered @ base ** np.arange(ordered.shape[1])[::-1]
+    return np.unique(ordered, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _three_corners(corners: np.ndarray) -> np.ndarray:
+    """The lowest three, sorted: enough to tell the faces of a solid apart."""
+    return np.sort(corners, axis=1)[:, :3]
+
+
+def _pair(keys: np.ndarray, regions: np.ndarray) -> np.ndarray:
+    """For every facet the region of the facet with the same key, or −1."""
+    order = np.argsort(keys, kind="stable")
+    same = keys[order][1:] == keys[order][:-1]
+    partner = np.full(len(keys), -1, dtype=regions.dtype)
+    first, second = order[:-1][same], order[1:][same]
+    partner[first], partner[second] = regions[second], regions[first]
+    return partner
+
+
+def _regions(mesh: Mesh) -> list[np.ndarray]:
+    """Regions of the elements of each block, numbered from 0; one region without labels."""
+    sizes = [len(nodes) for nodes in mesh.connectivity]
+    if mesh.labels is None or not mesh.labels.regions:
+        return [np.zeros(size, dtype=np.int64) for size in sizes]
+    tags = np.concatenate([np.asarray(part) for part in mesh.labels.regions])
+    numbers = np.unique(tags, return_inverse=True)[1].reshape(-1)
+    return np.split(numbers, np.cumsum(sizes)[:-1])
+
+
+def lengths(points: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Distances between the two nodes of pairs ``[…, 2]``."""
+    return np.linalg.norm(points[pairs[..., 1]] - points[pairs[..., 0]], axis=-1)
+
+
+def pair_codes(pairs: np.ndarray, count: int) -> np.ndarray:
+    """One integer for every pair of nodes ``[…, 2]`` of a mesh of `count`, whichever comes first."""
+    return pairs.min(axis=-1).astype(np.int64) * count + pairs.max(axis=-1)
+
+
+def node_pairs(mesh: Mesh) -> np.ndarray:
+    """Pairs of nodes that share an edge, each once ``[pairs, 2]``."""
+    parts = [np.asarray(nodes)[:, kind.segments].reshape(-1, 2) for kind, nodes in mesh.blocks]
+    pairs = np.sort(np.concatenate(parts), axis=1).astype(np.int64)
+    codes = np.unique(pairs[:, 0] * len(mesh.points) + pairs[:, 1])
+    return np.stack([codes // len(mesh.points), codes % len(mesh.points)], axis=1)
+
+
+def signed_measures(kind: ElementType, points: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Signed area or volume of the elements ``[elements]``, on the host."""
+    frames = np.einsum("ekd,qkj->eqdj", np.asarray(points)[np.asarray(nodes)], kind.gradients)
+    return np.linalg.det(frames) @ kind.weights

@@ -1,0 +1,357 @@
+"""How far an element is from its ideal: e ≥ 1, 1 only on the ideal element, with derivatives.
+
+Every metric here is a convex function of quantities (deformation, surface, measure) of which only
+the second derivative of the determinant is not convex.  The Hessian model leaves that one out and
+is positive semi-definite (as Garanzha, Kaporin, Kudryavtseva, Protais, Ray and Sokolov 2021,
+"Foldover-free maps in 50 lines of code").  Gradients are written out: reverse mode takes several
+times as long on CPU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxsmooth.cells.table import ElementType
+from jaxsmooth.numerics.small import cofactors, contract, determinant, power
+
+__all__ = [
+    "METRICS",
+    "Model",
+    "apply_model",
+    "hessian_model",
+    "inverse_quality",
+    "model_diagonal",
+    "positive_part",
+    "regularisation",
+]
+
+METRICS = ("shape", "mean_ratio")
+_EPS, _EPS_SLOPE = 0.1, 0.2  # ε of a degenerate mesh, and its growth with the worst inversion
+_KEEP = 4.0  # size weight per ε of elements below their size
+_SKEW = 0.5  # weight of the corner term beside the isoperimetric one
+_ROUND = 0.02  # radius of the rounded kink of `_excess`
+
+Nodes = Float[Array, "k dim"]
+Scalar = Float[Array, ""]
+
+
+def positive_part(det: Array, eps: Array | float) -> Array:
+    """χ(det) = (det + √(det² + ε²)) / 2: positive everywhere, det itself for ε = 0 and det > 0.
+
+    With it a barrier is finite on inverted elements and drives them out as ε falls (Escobar,
+    Rodríguez, Montenegro, Montero and González-Yuste 2003).
+    """
+    root = jnp.sqrt(det * det + eps * eps)
+    behind = (det < 0) & (root > 0)
+    without_cancellation = eps * eps / (2 * jnp.where(behind, root - det, 1))
+    return jnp.where(behind, without_cancellation, (det + root) / 2)
+
+
+def regularisation(worst: Scalar) -> Scalar:
+    """ε for a mesh whose least relative determinant is `worst`: none for a valid one.
+
+    Proportional to the worst inversion, so that it falls as the mesh untangles (Garanzha et al.
+    2021).  A valid mesh keeps its barrier, however small its determinants: they may be small
+    because elements have shrunk to a better shape.
+    """
+    return jnp.where(worst > 0, 0, _EPS - _EPS_SLOPE * worst)
+
+
+def _slope(det: Array, eps: Array | float) -> Array:
+    root = jnp.sqrt(det * det + eps * eps)
+    return jnp.where(root > 0, (1 + det / jnp.where(root > 0, root, 1)) / 2, 0)
+
+
+def isoperimetric(kind: ElementType, metric: str) -> bool:
+    """Whether the paper's q serves as the metric.
+
+    It does where it is largest on the ideal element: not for wedges and pyramids, nor for
+    quadratic elements, which raise it by bulging.
+    """
+    return metric == "shape" and kind.name in ("triangle", "quad", "tetra", "hexahedron")
+
+
+def _bounded(kind: ElementType, metric: str) -> bool:
+    """Whether the paper's q only bounds the metric, which is the mean ratio: where some elements
+    have less surface than the ideal one."""
+    return metric == "shape" and not isoperimetric(kind, metric)
+
+
+def _sampled(kind: ElementType, metric: str) -> bool:
+    """Whether the metric looks at the Jacobian at sample points: where it varies, or alone counts."""
+    return not isoperimetric(kind, metric) or len(kind.validity_gradients) > 1
+
+
+def _points(kind: ElementType) -> np.ndarray:
+    """Gradients at the sample points: the nodes of linear elements, nodes and quadrature points
+    of quadratic ones.  Validity is tested at both in any case."""
+    every = kind.validity_gradients
+    nodal = len(every) - len(kind.gradients)
+    return every[:nodal] if kind.order == 1 and nodal else every
+
+
+def _excess(ratio: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+    """About ``max(ratio − 1, 0)``, rounded to be smooth and convex, with two derivatives."""
+    x = jnp.maximum(ratio - 1, 0)
+    total = x + _ROUND
+    return x * x / total, x * (x + 2 * _ROUND) / total**2, jnp.where(x > 0, 2 * _ROUND**2 / total**3, 0)
+
+
+class _Volume(NamedTuple):
+    """Regularised measure, and its gradient ``[k, dim]``."""
+
+    value: Scalar
+    gradient: Nodes
+
+
+def _volume(kind: ElementType, nodes: Nodes, size: Scalar, eps: Scalar) -> _Volume:
+    reference = jnp.asarray(kind.gradients, nodes.dtype)
+    weights = jnp.asarray(kind.weights, nodes.dtype)
+    frames = contract(nodes, reference)
+    raw = (determinant(frames) * weights).sum() / size
+    stress = cofactors(frames) * (weights * _slope(raw, eps))[:, None, None]
+    return _Volume(size * positive_part(raw, eps), _to_nodes(reference, stress))
+
+
+class _Surface(NamedTuple):
+    """Perimeter or surface area, its gradient, and ``pull``: areas times inverse metrics."""
+
+    value: Scalar
+    gradient: Nodes
+    pull: Float[Array, "s j j"]
+
+
+def _surface(kind: ElementType, nodes: Nodes) -> _Surface:
+    reference = jnp.asarray(kind.facet_tangents, nodes.dtype)
+    weights = jnp.asarray(kind.facet_weights, nodes.dtype)
+    tangents = contract(nodes, reference)
+    gram = (tangents[:, :, :, None] * tangents[:, :, None, :]).sum(axis=1)
+    square = gram[:, 0, 0] if kind.dim == 2 else determinant(gram)
+    root = power(square, 0.5)
+    adjugate = jnp.ones_like(gram) if kind.dim == 2 else cofactors(gram)
+    solid = root > 0
+    pull = adjugate * (jnp.where(solid, 1 / jnp.where(solid, root, 1), 0) * weights)[:, None, None]
+    stress = (tangents[:, :, :, None] * pull[:, None, :, :]).sum(axis=2)
+    return _Surface((root * weights).sum(), _to_nodes(reference, stress), pull)
+
+
+class Samples(NamedTuple):
+    """Jacobians at the sample points, for value, gradient and Hessian model of the sampled part.
+
+    The model is ``f₁|dA|² + 2f₂ (A:dA)(C:dA) + f₃ (C:dA)²``, C the cofactors of A; A has its
+    columns divided by `lengths`.
+    """
+
+    frames: Float[Array, "q dim dim"]
+    cofactors: Float[Array, "q dim dim"]
+    factors: Float[Array, "q 3"]
+    inverse_lengths: Float[Array, "q dim"]
+
+
+def _samples(
+    kind: ElementType, metric: str, nodes: Nodes, size: Scalar, eps: Scalar
+) -> tuple[Scalar, Nodes, Samples]:
+    """Mean over the sample points of ``|A|² / (d det(A)^(2/d))``, its gradient, and the samples."""
+    dim = kind.dim
+    points = jnp.asarray(_points(kind), nodes.dtype)
+    frames = contract(nodes, points)
+    if isoperimetric(kind, metric):
+        # the columns' own lengths: by the arithmetic and geometric means the gradient of the
+        # normalised form is the one with the lengths held, and the model majorises
+        square = (frames * frames).sum(axis=-2)
+        inverse = jnp.where(square > 0, 1 / power(jnp.where(square > 0, square, 1), 0.5), 1)
+    else:
+        inverse = jnp.ones((len(points), dim), nodes.dtype)
+    frames = frames * inverse[:, None, :]
+    scale = inverse.prod(axis=-1) * size
+    raw = determinant(frames) / scale
+    slope, det = _slope(raw, eps), scale * positive_part(raw, eps)
+    square = (frames * frames).sum(axis=(-1, -2))
+    unit = 1 / (len(points) * dim * det ** (2 / dim))
+    first = -(2 / dim) * unit * square * slope / det
+    mixed = -(4 / dim) * unit * slope / det
+    bulk = -(2 / dim + 1) * first * slope / det
+    cof = cofactors(frames)
+    stress = (2 * unit)[:, None, None] * frames + first[:, None, None] * cof
+    gradient = _to_nodes(points, stress * inverse[:, None, :])
+    samples = Samples(frames, cof, jnp.stack([2 * unit, mixed, bulk], -1), inverse)
+    return (unit * square).sum(), gradient, samples
+
+
+def _size_weight(size_weight: Scalar, eps: Scalar, stretch: Scalar) -> Scalar:
+    """With ε, metrics without size would be best for elements that vanish."""
+    return size_weight + jnp.where(stretch < 1, _KEEP * eps, 0)
+
+
+class _Metric(NamedTuple):
+    """e, its gradient, and what the Hessian model needs."""
+
+    value: Scalar
+    gradient: Nodes
+    volume: _Volume
+    surface: _Surface | None
+    samples: Samples | None
+
+
+def _metric(kind: ElementType, metric: str, size_weight, nodes: Nodes, size, eps) -> _Metric:
+    dim = kind.dim
+    volume = _volume(kind, nodes, size, eps)
+    stretch = volume.value / size
+    size_weight = _size_weight(size_weight, eps, stretch)
+    value = size_weight * ((stretch + 1 / stretch) / 2 - 1)
+    gradient = size_weight * (1 - 1 / stretch**2) / (2 * size) * volume.gradient
+    surface = samples = None
+    if metric == "shape":
+        surface = _surface(kind, nodes)
+        ratio = (surface.value / kind.ideal_surface) ** 2 / volume.value ** (2 * (dim - 1) / dim)
+        slope = (
+            2 * ratio * (surface.gradient / surface.value - (dim - 1) / dim * volume.gradient / volume.value)
+        )
+        if _bounded(kind, metric):
+            ratio, rise, _ = _excess(ratio)
+            slope = rise * slope
+        value, gradient = value + ratio, gradient + slope
+    if _sampled(kind, metric):
+        mean, slope, samples = _samples(kind, metric, nodes, size, eps)
+        weight = _SKEW if isoperimetric(kind, metric) else 1.0
+        value = value + (weight * (mean - 1) if isoperimetric(kind, metric) else mean)
+        gradient = gradient + weight * slope
+    return _Metric(value, gradient, volume, surface, samples)
+
+
+def inverse_quality(
+    kind: ElementType, metric: str, size_weight: Scalar, nodes: Nodes, size: Scalar, eps: Scalar
+) -> tuple[Scalar, Nodes]:
+    """e ≥ 1 of one element, and its gradient ``[k, dim]``.
+
+    ``shape``: the inverse of the paper's q (Eqs. 1–5, β = 2), ``(S/S_ideal)² / V^(2(d−1)/d)``.
+    q is blunt about corners, so elements whose Jacobian varies add the excess of the mean over
+    the sample points of ``|A|² / (d det(A)^(2/d))``; for quadrilaterals and hexahedra with the
+    columns of A normalised, which leaves aspect ratios to q: it is the scaled Jacobian to the
+    power −2/d.  Wedges, pyramids and quadratic elements take the mean ratio and the excess of the
+    inverse q over 1.
+    ``mean_ratio``: the mean over the sample points of ``|A|² / (d det(A)^(2/d))``,
+    A the deformation gradient from the ideal element (Knupp 2001).
+
+    Args:
+        kind: the element type.
+        metric: ``"shape"`` or ``"mean_ratio"``.
+        size_weight: of ``(τ + 1/τ)/2 − 1``, τ the measure over the target's; 0 leaves it free, but
+            with ε elements below their size are kept from vanishing.
+        nodes: ``[k, dim]``.
+        size: measure of the target element.
+        eps: ε of the regularised determinant, relative to `size`.
+    """
+    found = _metric(kind, metric, size_weight, nodes, size, eps)
+    return found.value, found.gradient
+
+
+class Model(NamedTuple):
+    """Hessian model of one element: a sum of squares.
+
+    Attributes:
+        facets: ``[s, dim−1, dim−1]``: metric tensors of the facets, times what they weigh.
+        samples: see `Samples`.
+        vectors: nodal fields ``[m, k, dim]`` whose products with a displacement are squared:
+            the gradients of e, of the size, and of the isoperimetric ratio.
+    """
+
+    facets: Array | None
+    samples: Samples | None
+    vectors: Float[Array, "m k dim"]
+
+
+def hessian_model(
+    kind: ElementType,
+    metric: str,
+    size_weight: Scalar,
+    aggregate: Callable[[Scalar], tuple[Scalar, Scalar]],
+    nodes: Nodes,
+    size: Scalar,
+    eps: Scalar,
+) -> Model:
+    """Positive semi-definite model of the Hessian of φ(e) of one element.
+
+    Left out: the second derivative of the determinant, and φ″ where negative.  Surfaces enter by
+    their Dirichlet energy over the present surface, which majorises the area.
+    """
+    dim = kind.dim
+    found = _metric(kind, metric, size_weight, nodes, size, eps)
+    first, second = aggregate(found.value)
+    volume, surface, samples = found.volume, found.surface, found.samples
+    vectors = [
+        jnp.sqrt(jnp.maximum(second, 0)) * found.gradient,
+        jnp.sqrt(first * _size_weight(size_weight, eps, volume.value / size) * size / volume.value**3)
+        * volume.gradient,
+    ]
+    facets = None
+    if surface is not None:
+        # S^d / V^(d−1) has second differential ∝ (dS − S/V dV)² where S and V are linear
+        ratio = (surface.value / kind.ideal_surface) ** 2 / volume.value ** (2 * (dim - 1) / dim)
+        change = surface.gradient / surface.value - volume.gradient / volume.value
+        weight = first
+        if _bounded(kind, metric):
+            _, rise, bend = _excess(ratio)
+            weight = first * rise
+            slope = surface.gradient / surface.value - (dim - 1) / dim * volume.gradient / volume.value
+            vectors.append(jnp.sqrt(first * bend) * 2 * ratio * slope)
+        vectors.append(jnp.sqrt(weight * 2 * (dim - 1) * ratio) * change)
+        facets = weight * 2 * ratio / surface.value * surface.pull
+    if samples is not None:
+        weight = first * (_SKEW if isoperimetric(kind, metric) else 1)
+        samples = samples._replace(factors=weight * samples.factors)
+    return Model(facets, samples, jnp.stack(vectors))
+
+
+def _to_nodes(gradients: Float[Array, "q k j"], stress: Float[Array, "q dim j"]) -> Nodes:
+    return (gradients[:, :, None, :] * stress[:, None]).sum(axis=(0, -1))
+
+
+def apply_model(kind: ElementType, move: Nodes, model: Model) -> Nodes:
+    """The model times a displacement ``[k, dim]``."""
+    force = ((model.vectors * move).sum(axis=(-1, -2))[:, None, None] * model.vectors).sum(axis=0)
+    if model.facets is not None:
+        tangents = jnp.asarray(kind.facet_tangents, move.dtype)
+        change = contract(move, tangents)
+        stress = (change[:, :, :, None] * model.facets[:, None, :, :]).sum(axis=2)
+        force = force + _to_nodes(tangents, stress)
+    if model.samples is not None:
+        frames, cof, factors, inverse = model.samples
+        points = jnp.asarray(_points(kind), move.dtype)
+        change = contract(move, points) * inverse[:, None, :]
+        a, c = (frames * change).sum(axis=(-1, -2)), (cof * change).sum(axis=(-1, -2))
+        plain, mixed, bulk = factors[:, 0], factors[:, 1], factors[:, 2]
+        along, across = mixed * c, mixed * a + bulk * c
+        stress = plain[:, None, None] * change + along[:, None, None] * frames + across[:, None, None] * cof
+        force = force + _to_nodes(points, stress * inverse[:, None, :])
+    return force
+
+
+def model_diagonal(kind: ElementType, model: Model) -> Float[Array, "k dim dim"]:
+    """Diagonal node blocks of the model."""
+    eye = jnp.eye(kind.dim, dtype=model.vectors.dtype)
+    blocks = _outer(model.vectors, model.vectors).sum(axis=0)
+    if model.facets is not None:
+        tangents = jnp.asarray(kind.facet_tangents, eye.dtype)
+        turned = (tangents[:, :, :, None] * model.facets[:, None, :, :]).sum(axis=2)
+        blocks = blocks + (turned * tangents).sum(axis=(0, -1))[:, None, None] * eye
+    if model.samples is not None:
+        frames, cof, factors, inverse = model.samples
+        points = jnp.asarray(_points(kind), eye.dtype) * inverse[:, None, :]
+        a = (frames[:, None] * points[:, :, None, :]).sum(axis=-1)
+        c = (cof[:, None] * points[:, :, None, :]).sum(axis=-1)
+        plain, mixed, bulk = (factors[:, i, None, None, None] for i in range(3))
+        square = (points * points).sum(axis=-1)[..., None, None] * eye
+        cross = _outer(a, c)
+        part = plain * square + mixed * (cross + jnp.swapaxes(cross, -1, -2)) + bulk * _outer(c, c)
+        blocks = blocks + part.sum(axis=0)
+    return blocks
+
+
+def _outer(a: Array, b: Array) -> Array:
+    return a[..., :, None] * b[..., None, :]

@@ -1,0 +1,58 @@
+"""The evaluation of a mesh: what every element is worth."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+from jaxtyping import Array, Float
+
+from jaxsmooth.assembly import cut, each
+from jaxsmooth.cells.table import ElementType
+from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.metrics.table import min_jacobian, scaled_jacobian, shape_quality
+from jaxsmooth.metrics.validity import determinant_bound
+from jaxsmooth.numerics.small import Frame
+
+__all__ = ["Evaluation", "evaluate"]
+
+Blocks = tuple[Float[Array, " _"], ...]
+
+_HEAVY = 4  # memory of an evaluation at many points, in units of a product with linear tetrahedra
+
+
+class Evaluation(NamedTuple):
+    """What every element is worth, block by block.
+
+    Attributes:
+        quality: the paper's q (Eqs. 1–5).
+        jacobian: a bound of the Jacobian determinant, of the mesh scaled to about unit size: where it
+            is positive the element is valid everywhere; else it is inverted, or not proven valid.
+        corners: scaled Jacobian, which sees single corners; None for triangles and tetrahedra, of
+            which q does.
+    """
+
+    quality: Blocks
+    jacobian: Blocks
+    corners: tuple[Float[Array, " _"] | None, ...]
+
+
+def evaluate(mesh: Mesh, beta: Float[Array, ""] | float = 2.0) -> Evaluation:
+    """Quality, validity and corners of all elements."""
+    points = Frame.of(mesh.points).into(mesh.points)
+
+    def element(kind: ElementType, _: None, nodes: Float[Array, "k dim"]) -> tuple[Array, ...]:
+        q = shape_quality(kind, nodes, beta)
+        if kind.constant_jacobian:  # a fair q means open corners
+            return q, min_jacobian(kind, nodes)
+        return q, determinant_bound(kind, nodes), scaled_jacobian(kind, nodes)
+
+    found = [
+        each(
+            partial(element, kind),
+            cut(nodes, None, mesh.execution, 1 if kind.constant_jacobian else _HEAVY),
+            points,
+        )
+        for kind, nodes in mesh.blocks
+    ]
+    return Evaluation(*zip(*((*values, None)[:3] for values in found), strict=True))

@@ -1,0 +1,62 @@
+"""The summary of a mesh, which history, tables, reports and acceptance share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxsmooth.assembly import gather
+from jaxsmooth.convert.meshfile import as_mesh
+from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.metrics.evaluation import Evaluation, evaluate
+from jaxsmooth.metrics.table import scaled_jacobian
+from jaxsmooth.metrics.validity import inverted
+
+__all__ = ["POOR", "Statistics", "evaluated", "statistics"]
+
+POOR = 0.2
+"""Quality below which an element counts as poor (Tables 7 and 8)."""
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Statistics of a mesh; σ is the sample deviation, `below` counts poor elements (q < 0.2)."""
+
+    q_min: float
+    q_max: float
+    q_avg: float
+    q_std: float
+    below: int
+    inverted: int
+    scaled_jacobian_min: float
+
+
+evaluated = jax.jit(evaluate)
+"""`evaluate`, compiled."""
+
+
+@partial(jax.jit, static_argnames=("threshold",))
+def _summary(mesh: Mesh, evaluation: Evaluation, threshold: float) -> tuple[Array, ...]:
+    q = jnp.concatenate(evaluation.quality)
+    deviation = jnp.std(q, ddof=1) if q.size > 1 else jnp.zeros((), q.dtype)
+    corners = [
+        jax.vmap(partial(scaled_jacobian, kind))(gather(mesh.points, nodes)) if known is None else known
+        for (kind, nodes), known in zip(mesh.blocks, evaluation.corners, strict=True)
+    ]
+    worst = jnp.stack([part.min() for part in corners]).min()
+    return q.min(), q.max(), q.mean(), deviation, worst, (q < threshold).sum()
+
+
+def statistics(mesh: Any, evaluation: Evaluation | None = None, threshold: float = POOR) -> Statistics:
+    """Statistics of a mesh; an `evaluation` that is already known saves time."""
+    mesh = as_mesh(mesh).bare
+    evaluation = evaluated(mesh) if evaluation is None else evaluation
+    *values, below = (value.item() for value in jax.device_get(_summary(mesh, evaluation, threshold)))
+    tangled = sum(int(part.sum()) for part in inverted(mesh, evaluation.jacobian))
+    q_min, q_max, q_avg, q_std, worst = values
+    return Statistics(q_min, q_max, q_avg, q_std, below, tangled, worst)

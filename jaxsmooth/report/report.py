@@ -1,0 +1,368 @@
+"""What people see: progress lines, tables, JSON, and the HTML report."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import math
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from jaxsmooth.convert.meshfile import MeshFile
+from jaxsmooth.files.outputs import Outputs
+from jaxsmooth.guards.acceptance import POOR
+from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.metrics.table import METRICS, quality
+from jaxsmooth.metrics.validity import inverted
+from jaxsmooth.motion.base import Motion
+from jaxsmooth.runs.driver import SmoothResult, StepRecord
+
+__all__ = [
+    "Clock",
+    "as_json",
+    "compare_row",
+    "console",
+    "counts",
+    "html_page",
+    "movable_elements",
+    "print_compare",
+    "print_comparison",
+    "quality_rows",
+    "write_html",
+]
+
+
+class Clock:
+    """Wall seconds by phase, and the part of them that JAX spent on compiling."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._compiled: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, phase: str) -> Iterator[None]:
+        start, compiled = time.perf_counter(), _compile_seconds()
+        yield
+        for total, spent in (
+            (self.seconds, time.perf_counter() - start),
+            (self._compiled, _compile_seconds() - compiled),
+        ):
+            total[phase] = total.get(phase, 0.0) + spent
+
+    def split(self) -> dict[str, float]:
+        """The phases with compilation taken out of them and shown as a phase of its own."""
+        parts = {k: max(v - self._compiled[k], 0.0) for k, v in self.seconds.items()}
+        return {**parts, "compile": sum(self._compiled.values())}
+
+
+_compiling = [0.0]
+
+
+def _compile_seconds() -> float:
+    if not _compiling[1:]:
+
+        def listen(event: str, duration: float, **_: Any) -> None:
+            if event in ("/jax/core/compile/backend_compile_duration", _LOWERING):
+                _compiling[0] += duration
+
+        jax.monitoring.register_event_duration_secs_listener(listen)
+        _compiling.append(1.0)
+    return _compiling[0]
+
+
+_LOWERING = "/jax/core/compile/jaxpr_to_mlir_module_duration"
+
+
+# --- Numbers ---------------------------------------------------------------------------
+
+
+def movable_elements(mesh: Mesh, constraints: Motion) -> tuple[np.ndarray, ...]:
+    """Masks ``[elements]``, one a block, of the elements with a node that may move."""
+    free = constraints.at(mesh.points).freedom > 0
+    return tuple(free[np.asarray(nodes)].any(axis=1) for nodes in mesh.connectivity)
+
+
+def _values(mesh: Mesh, name: str, masks: tuple[np.ndarray, ...] | None = None) -> np.ndarray:
+    parts = [np.asarray(part, np.float64) for part in quality(mesh, name)]
+    if masks is not None:
+        parts = [part[mask] for part, mask in zip(parts, masks, strict=True)]
+    return np.concatenate(parts)
+
+
+def summarise(mesh: Mesh, masks: tuple[np.ndarray, ...] | None = None) -> dict[str, float]:
+    """The statistics of the final table, over all or over chosen elements."""
+    q, tangled = _values(mesh, "shape", masks), inverted(mesh)
+    if masks is not None:
+        tangled = tuple(part[mask] for part, mask in zip(tangled, masks, strict=True))
+    scaled = _values(mesh, "scaled_jacobian", masks)
+    if len(q) == 0:
+        return {}
+    return {
+        "q_min": q.min(),
+        "q_avg": q.mean(),
+        "q_max": q.max(),
+        "q_std": q.std(ddof=1) if len(q) > 1 else 0.0,
+        "q_below_0.2": int((q < POOR).sum()),
+        "inverted": sum(int(part.sum()) for part in tangled),
+        "scaled_jacobian_min": scaled.min(),
+    }
+
+
+def counts(mesh: Mesh) -> dict[str, Any]:
+    """Numbers of nodes and of elements by type."""
+    sizes = {name: len(nodes) for name, nodes in zip(mesh.types, mesh.connectivity, strict=True)}
+    return {"nodes": len(mesh.points), "elements": sizes}
+
+
+def as_json(
+    source: str,
+    output: str,
+    method: str,
+    result: SmoothResult,
+    seconds: dict,
+    notes: Sequence[str] = (),
+) -> dict[str, Any]:
+    """The documented JSON of ``smooth``; `notes` are those of the reader and of the writer."""
+    return _finite(
+        {
+            "input": str(source),
+            "output": str(output),
+            "method": method,
+            "precision": str(result.mesh.points.dtype),
+            "device": jax.default_backend(),
+            **counts(result.mesh),
+            "status": str(result.status),
+            "steps": [row.as_json() for row in result.history],
+            "seconds": seconds,
+            "notes": list(notes),
+        }
+    )
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no NaN: null stands for it."""
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_finite(v) for v in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(value) else None
+    return value
+
+
+def quality_rows(mesh: Mesh, names: list[str]) -> list[dict[str, Any]]:
+    """One row of statistics for every metric and every element block."""
+    rows = []
+    for name in names:
+        row = METRICS[name]
+        for kind, block in zip(mesh.types, quality(mesh, name), strict=True):
+            values = np.asarray(block, np.float64)
+            low, high = row.acceptable
+            rows.append(
+                _finite(
+                    {
+                        "metric": name,
+                        "type": kind,
+                        "elements": len(values),
+                        "min": values.min(),
+                        "avg": values.mean(),
+                        "max": values.max(),
+                        "std": values.std(ddof=1) if len(values) > 1 else 0.0,
+                        "unacceptable": int((~((values >= low) & (values <= high))).sum()),
+                    }
+                )
+            )
+    tangled = sum(int(part.sum()) for part in inverted(mesh))
+    for entry in rows:
+        entry["inverted"] = tangled
+    return rows
+
+
+def compare_row(
+    name: str, mesh: Mesh, result: SmoothResult | None, constraints: Motion, seconds: dict
+) -> dict[str, Any]:
+    """One row of ``compare``: statistics over all and over movable elements, steps, seconds."""
+    final = mesh if result is None else result.mesh
+    masks = movable_elements(mesh, constraints)
+    return _finite(
+        {
+            "method": name,
+            "all": summarise(final),
+            "movable": summarise(final, masks),
+            "steps": 0 if result is None else len(result.history) - 1,
+            "status": "" if result is None else str(result.status),
+            "seconds": seconds.get("smooth", 0.0),
+            "compile_seconds": seconds.get("compile", 0.0),
+        }
+    )
+
+
+# --- Console ---------------------------------------------------------------------------
+
+
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        """Whoever reads has read enough (``| head``); the work goes on."""
+        self.quiet = True
+
+
+def console(quiet: bool = False) -> Console:
+    """Where people read: standard output; silent when `quiet`.  Names of files are printed as they are."""
+    out = _Console(quiet=quiet, highlight=False, soft_wrap=True, markup=False, emoji=False)
+    if not out.is_terminal:
+        out.width = 160
+    return out
+
+
+def print_file(out: Console, file: MeshFile) -> None:
+    """What was read, and what the reader noticed."""
+    sizes = counts(file.mesh)
+    elements = ", ".join(f"{number:,} {name}" for name, number in sizes["elements"].items())
+    out.print(f"{file.path}: {sizes['nodes']:,} nodes; {elements}")
+    print_notes(out, file.notes)
+
+
+def print_notes(out: Console, notes: tuple[str, ...]) -> None:
+    """What the reader or the writer noticed."""
+    for note in notes:
+        out.print(f"  note: {note}", style="yellow")
+
+
+def print_constraints(out: Console, constraints: Motion, mesh: Mesh) -> None:
+    """How many nodes are held, slide, or are free."""
+    freedom, dim = constraints.at(mesh.points).freedom, mesh.dim
+    names = ("held", "sliding on an edge", "sliding on a face", "free")
+    names = (*names[:dim], names[-1])
+    parts = [f"{(freedom == value).sum():,} {name}" for value, name in enumerate(names)]
+    out.print(f"nodes: {', '.join(parts)}")
+
+
+def print_step(out: Console, row: StepRecord) -> None:
+    """The progress line of a step."""
+    s = row.statistics
+    solver = f"  {row.solver_iterations:4d} iterations" if row.step else " " * 17
+    out.print(
+        f"step {row.step:2d}  q_min {s.q_min:7.4f}  q_avg {s.q_avg:7.4f}  below 0.2 {s.below:6d}"
+        f"  inverted {s.inverted:5d}{solver}  {row.seconds:6.2f} s"
+    )
+
+
+_ROWS = (
+    ("q_min", "q_min", ".4f"),
+    ("q_avg", "q_avg", ".4f"),
+    ("q_max", "q_max", ".4f"),
+    ("q_std", "σ", ".4f"),
+    ("q_below_0.2", "q < 0.2", ",d"),
+    ("inverted", "inverted", ",d"),
+    ("scaled_jacobian_min", "scaled Jacobian, min", ".4f"),
+)
+
+
+def comparison(before: Mesh, result: SmoothResult) -> list[tuple[str, ...]]:
+    """Rows of the before/after table: label, all before, all after, movable before, after."""
+    masks = movable_elements(before, result.constraints)
+    columns = [summarise(m, mask) for mask in (None, masks) for m in (before, result.mesh)]
+    return [(label, *(format(c[key], style) if c else "–" for c in columns)) for key, label, style in _ROWS]
+
+
+def print_comparison(out: Console, before: Mesh, result: SmoothResult) -> None:
+    """The final table: before and after, over all and over movable elements."""
+    table = Table(box=None, pad_edge=False)
+    table.add_column("")
+    for group in ("all", "movable"):
+        for moment in ("before", "after"):
+            table.add_column(f"{group}\n{moment}", justify="right")
+    for row in comparison(before, result):
+        table.add_row(*row)
+    out.print(table)
+
+
+def print_quality(out: Console, rows: list[dict[str, Any]]) -> None:
+    """The table of ``quality``."""
+    table = Table(box=None, pad_edge=False)
+    for name in ("metric", "type", "elements", "min", "avg", "max", "std", "unacceptable"):
+        table.add_column(name, justify="left" if name in ("metric", "type") else "right", no_wrap=True)
+    for row in rows:
+        numbers = [_number(row[name]) for name in ("min", "avg", "max", "std")]
+        count, bad = f"{row['elements']:,}", f"{row['unacceptable']:,}"
+        table.add_row(row["metric"], row["type"], count, *numbers, bad)
+    out.print(table)
+    if rows and rows[0]["inverted"]:
+        out.print(f"{rows[0]['inverted']:,} elements are inverted", style="red")
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4g}"
+
+
+def print_compare(out: Console, rows: list[dict[str, Any]]) -> None:
+    """The table of ``compare``: all elements, with movable ones behind the bar."""
+    table = Table(box=None, pad_edge=False)
+    heads = ("method", "q_min", "q_avg", "q<0.2", "sj_min", "inverted", "|", "q_min", "q_avg", "q<0.2")
+    for name in (*heads, "steps", "seconds", "compile"):
+        table.add_column(name, justify="left" if name == "method" else "right", no_wrap=True)
+    for row in rows:
+        whole, part = row["all"], row["movable"]
+        cells = [_number(whole["q_min"]), _number(whole["q_avg"]), f"{whole['q_below_0.2']:,}"]
+        cells += [_number(whole["scaled_jacobian_min"]), f"{whole['inverted']:,}", "|"]
+        cells += [_number(part.get("q_min")), _number(part.get("q_avg")), f"{part.get('q_below_0.2', 0):,}"]
+        cells += [str(row["steps"]), f"{row['seconds']:.2f}", f"{row['compile_seconds']:.1f}"]
+        table.add_row(row["method"], *cells)
+    out.print(table)
+    out.print("all elements | elements with a node that may move; seconds without compilation", style="dim")
+
+
+# --- HTML ------------------------------------------------------------------------------
+
+
+def write_html(path: str | Path, title: str, before: Mesh, result: SmoothResult) -> None:
+    """Write `html_page` to a file, complete or not at all."""
+    with Outputs() as outputs:
+        outputs.text(path, html_page(title, before, result))
+        outputs.commit()
+
+
+def html_page(title: str, before: Mesh, result: SmoothResult) -> str:
+    """A report in one page: picture, before/after table, history.  Needs the `viz` extra."""
+    from jaxsmooth.report.pictures import before_after
+
+    title = title.encode("utf-8", "replace").decode()  # names of files may be any bytes
+    buffer = io.BytesIO()
+    before_after(before, result.mesh, title).savefig(buffer, format="png", dpi=130)
+    picture = base64.b64encode(buffer.getvalue()).decode()
+    table = _html_table(
+        ("", "all before", "all after", "movable before", "movable after"), comparison(before, result)
+    )
+    heads = ("step", "q_min", "q_avg", "q_max", "σ", "q < 0.2", "inverted", "iterations", "seconds")
+    steps = []
+    for row in result.history:
+        s = asdict(row.statistics)
+        numbers = [f"{s[key]:.4f}" for key in ("q_min", "q_avg", "q_max", "q_std")]
+        tail = (s["below"], s["inverted"], row.solver_iterations, f"{row.seconds:.2f}")
+        steps.append((row.step, *numbers, *tail))
+    title = html.escape(title)
+    return f"""<!doctype html><meta charset="utf-8"><title>{title}</title>
+<style>body{{font:15px/1.5 system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem}}
+td,th{{padding:.15rem .8rem;text-align:right}}td:first-child,th:first-child{{text-align:left}}
+tr:nth-child(even){{background:#f4f4f4}}img{{max-width:100%}}</style>
+<h1>{title}</h1><p>{html.escape(str(result.status))}; {len(result.mesh.points):,} nodes.</p>
+<img alt="before and after" src="data:image/png;base64,{picture}">{table}
+<h2>Steps</h2>{_html_table(heads, steps)}
+"""
+
+
+def _html_table(heads: tuple[str, ...], rows: list[tuple]) -> str:
+    def line(cells: tuple, tag: str) -> str:
+        return "<tr>" + "".join(f"<{tag}>{html.escape(str(c))}</{tag}>" for c in cells) + "</tr>"
+
+    return f"<table>{line(heads, 'th')}{''.join(line(row, 'td') for row in rows)}</table>"

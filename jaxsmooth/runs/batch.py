@@ -1,0 +1,106 @@
+"""Many meshes in one call: meshes of different sizes padded to one shape."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxsmooth.cells.table import element_type
+from jaxsmooth.convert.meshfile import as_mesh
+from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.motion.detect import detect_constraints
+from jaxsmooth.motion.planar import Constraints
+
+__all__ = ["Batch", "stack"]
+
+
+class Batch(eqx.Module):
+    """Meshes with a leading batch axis on every leaf, for `jax.vmap`.
+
+    Ghost elements fill the blocks: each is an ideal element on held nodes of its own, apart from
+    the mesh, so that it neither pulls nor offends and no method needs to know of it.
+
+    Attributes:
+        mesh: points ``[batch, nodes, dim]``, connectivity ``[batch, elements, k]``.
+        constraints: projectors ``[batch, nodes, dim, dim]``; ghost nodes are held.
+        nodes: true for the nodes of the meshes ``[batch, nodes]``.
+        elements: one mask ``[batch, elements]`` a block.
+    """
+
+    mesh: Mesh
+    constraints: Constraints
+    nodes: Bool[Array, "batch nodes"]
+    elements: tuple[Bool[Array, "batch elements"], ...]
+
+    def points(self, mesh: Mesh | None = None) -> list[Float[Array, "nodes dim"]]:
+        """The points of each mesh without ghosts, of `mesh` or of the batch itself."""
+        points = (self.mesh if mesh is None else mesh).points
+        counts = np.asarray(self.nodes).sum(axis=1)
+        return [points[i, :count] for i, count in enumerate(counts)]
+
+    def mean(self, values: tuple[Float[Array, "batch elements"], ...]) -> Float[Array, " batch"]:
+        """Mean over the real elements of each mesh, of values given block by block."""
+        total = sum(jnp.where(m, v, 0).sum(axis=1) for m, v in zip(self.elements, values, strict=True))
+        return total / sum(m.sum(axis=1) for m in self.elements)
+
+
+def stack(meshes: Sequence[Any], constraints: Sequence[Constraints] | None = None) -> Batch:
+    """Pad meshes of one dimension to a common shape and stack them.
+
+    Args:
+        meshes: each a `Mesh` or whatever else `as_mesh` takes; their blocks may differ in size and type.
+        constraints: theirs; detected by default.
+
+    Returns:
+        The batch.
+
+    Raises:
+        ValueError: for no meshes, or meshes of different dimensions.
+    """
+    meshes = [as_mesh(mesh) for mesh in meshes]
+    if not meshes or len({mesh.dim for mesh in meshes}) > 1:
+        raise ValueError("stack needs meshes of one dimension, at least one")
+    constraints = [detect_constraints(m) for m in meshes] if constraints is None else constraints
+    types = sorted({name for mesh in meshes for name in mesh.types})
+    kinds = [element_type(name) for name in types]
+    joined = [{name: [] for name in types} for _ in meshes]
+    for blocks, mesh in zip(joined, meshes, strict=True):
+        for name, nodes in zip(mesh.types, mesh.connectivity, strict=True):
+            blocks[name].append(np.asarray(nodes))
+    sizes = {name: max(sum(map(len, blocks[name])) for blocks in joined) for name in types}
+    real = max(len(mesh.points) for mesh in meshes)
+    starts = real + np.cumsum([0, *(kind.k for kind in kinds)])
+    dim = meshes[0].dim
+
+    rows = []
+    for mesh, held, blocks in zip(meshes, constraints, joined, strict=True):
+        count = len(mesh.points)
+        dtype = mesh.points.dtype
+        ghosts = np.concatenate([kind.ideal for kind in kinds]).astype(dtype)
+        filler = np.zeros((real - count, dim), dtype)
+        points = jnp.concatenate([mesh.points, filler, ghosts])
+        projectors = jnp.zeros((len(points), dim, dim), dtype).at[:count].set(held.projectors)
+        connectivity, masks = [], []
+        for name, kind, start in zip(types, kinds, starts, strict=False):
+            nodes = np.concatenate([np.zeros((0, kind.k), np.int32), *blocks[name]])
+            ghost = np.tile(np.arange(start, start + kind.k), (sizes[name] - len(nodes), 1))
+            connectivity.append(np.concatenate([nodes, ghost]).astype(np.int32))
+            masks.append(np.arange(sizes[name]) < len(nodes))
+        rows.append((points, projectors, np.arange(len(points)) < count, connectivity, masks))
+    points, projectors, nodes, connectivity, masks = zip(*rows, strict=True)
+    mesh = eqx.tree_at(
+        lambda m: (m.points, m.connectivity),
+        Mesh(points[0], list(zip(types, connectivity[0], strict=True))),
+        (jnp.stack(points), tuple(jnp.asarray(np.stack(c)) for c in zip(*connectivity, strict=True))),
+    )
+    return Batch(
+        mesh,
+        Constraints(jnp.stack(projectors)),
+        jnp.asarray(np.stack(nodes)),
+        tuple(jnp.asarray(np.stack(m)) for m in zip(*masks, strict=True)),
+    )

@@ -1,0 +1,190 @@
+"""Whole runs as pure functions: differentiable, jittable, and ready for `jax.vmap`.
+
+`smooth` decides on the host when to stop and what to report; here nothing is decided.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxsmooth.convert.meshfile import as_mesh
+from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.methods import Elastic, Method
+from jaxsmooth.metrics.evaluation import evaluate
+from jaxsmooth.motion.base import Motion
+
+__all__ = ["FixedPoint", "fixed_point", "run", "step"]
+
+Field = Float[Array, "nodes dim"]
+_UNNESTED = 16  # steps whose points alone are kept; more are nested, for memory ~ √steps
+
+
+def step(mesh: Any, method: Method, constraints: Motion) -> Mesh:
+    """One step of a method, ``mesh -> mesh``: the differentiable atom of all runs.
+
+    Derivatives go through quality, fit, forces and the solve; the fractions of the moves that
+    the guard accepts are constants for them.
+    """
+    mesh = as_mesh(mesh)
+    before = jax.lax.stop_gradient(evaluate(mesh))
+    return mesh.with_points(method.step(mesh, constraints, before).points)
+
+
+def run(mesh: Any, method: Method | None = None, *, constraints: Motion, steps: int = 3) -> Mesh:
+    """A fixed number of steps.
+
+    Reverse mode keeps, for every step, the points, the displacement and the guard's decision,
+    and computes the rest again: memory hardly grows with the number of steps and not at all
+    with the iterations of the solver.  Under differentiation the linear systems are solved
+    tightly (`solve.gradient_tolerance`).
+
+    Args:
+        mesh: a `Mesh`, whose points may be traced, batched, or both; or whatever else `as_mesh` takes.
+        method: `Elastic()` by default.
+        constraints: how nodes may move (found beforehand, from concrete points).
+        steps: number of steps (static).
+
+    Returns:
+        The smoothed mesh.
+    """
+    mesh = as_mesh(mesh)
+    method = _prepared(method, mesh)
+    saved = jax.checkpoint_policies.save_only_these_names("displacement", "accepted")
+
+    def advance(points: Field, index: Int[Array, ""]) -> tuple[Field, None]:
+        def move(points: Field) -> Field:
+            return step(mesh.with_points(points), method, constraints).points
+
+        return jax.lax.cond(index < steps, move, lambda p: p, points), None
+
+    inner = steps if steps <= _UNNESTED else math.ceil(math.sqrt(steps))
+    outer = -(-steps // max(inner, 1))
+    one = jax.checkpoint(advance, policy=saved)
+
+    def several(points: Field, indices: Int[Array, " inner"]) -> tuple[Field, None]:
+        return jax.lax.scan(one, points, indices)
+
+    if outer <= 1:
+        return mesh.with_points(several(mesh.points, jnp.arange(steps))[0])
+    indices = jnp.arange(outer * inner).reshape(outer, inner)
+    return mesh.with_points(jax.lax.scan(jax.checkpoint(several), mesh.points, indices)[0])
+
+
+def _prepared(method: Method | None, mesh: Mesh) -> Method:
+    """The method with its host-side work done, where the connectivity is known on the host."""
+    method = Elastic() if method is None else method
+    traced = any(isinstance(nodes, jax.core.Tracer) for nodes in mesh.connectivity)
+    return method if traced else method.prepare(mesh)
+
+
+class FixedPoint(eqx.Module):
+    """A converged mesh.
+
+    Attributes:
+        mesh: the mesh that a further step leaves where it is.
+        steps: steps taken.
+        change: largest move of the last step, relative to the size of the domain.
+    """
+
+    mesh: Mesh
+    steps: Int[Array, ""]
+    change: Float[Array, ""]
+
+
+def fixed_point(
+    mesh: Any,
+    method: Method | None = None,
+    *,
+    constraints: Motion,
+    tolerance: float = 1e-9,
+    max_steps: int = 200,
+) -> FixedPoint:
+    """Repeat unguarded steps until the mesh stays where it is, with an implicit derivative.
+
+    With z the points that are held and u the free displacements, the mesh solves
+    ``u = G(u, z) = P (step(z + P u) − z)``.  Its derivative is ``(I − G_u)⁻¹ G_z``, found by
+    repeating the linearised step until it converges: one iteration for any number of steps,
+    and no dependence on where the free nodes started.
+
+    Args:
+        mesh: the start, a mesh as for `run`; near enough to a valid mesh that no guard is needed.
+        method: `Elastic()` by default; solved tightly throughout.
+        constraints: how nodes may move.
+        tolerance: on the largest move, relative to the size of the domain.
+        max_steps: bound on steps, and on the iterations of the derivative.
+
+    Returns:
+        The mesh, the number of steps and the last change: compare it with `tolerance`.
+    """
+    mesh = as_mesh(mesh)
+    method = _prepared(method, mesh)
+    method = eqx.tree_at(lambda m: m.guard, method, None, is_leaf=lambda x: x is None)
+    stopped = jax.lax.stop_gradient
+    points = mesh.points
+    extent = stopped(jnp.ptp(points, axis=0).max())
+
+    def place(u: Field, points: Field, motion: Motion) -> Field:
+        return motion.retract(points, motion.at(points).expand(u))
+
+    def displaced(u: Field, method: Method, points: Field, motion: Motion) -> Field:
+        after = step(mesh.with_points(place(u, points, motion)), method, motion).points
+        return motion.at(points).independent(after - points)
+
+    def search(u: Field):
+        fixed = stopped((method, points, constraints))
+
+        def unfinished(state):
+            _, change, count = state
+            return (change > tolerance) & (count < max_steps)
+
+        def again(state):
+            u, _, count = state
+            new = displaced(u, *fixed)
+            return new, jnp.abs(new - u).max() / extent, count + 1
+
+        # jvp makes the steps solve as tightly as their derivative does
+        return jax.lax.while_loop(unfinished, again, (u, jnp.asarray(jnp.inf, u.dtype), jnp.int32(0)))
+
+    u, change, count = search(jnp.zeros_like(points))
+    u = _implicit(displaced, u, (method, points, constraints), tolerance, max_steps)
+    return FixedPoint(mesh.with_points(place(u, points, constraints)), count, change)
+
+
+def _implicit(function, solution: Field, parameters, tolerance: float, max_steps: int) -> Field:
+    """`solution` of ``u = function(u, *parameters)`` with its derivative with respect to them."""
+
+    @jax.custom_jvp
+    def attach(solution, parameters):
+        return solution
+
+    @attach.defjvp
+    def _(primals, tangents):
+        solution, parameters = primals
+        _, change = jax.jvp(lambda p: function(solution, *p), (parameters,), tangents[1:])
+        _, slope = jax.linearize(lambda u: function(u, *parameters), solution)
+
+        def iterate(matvec, right):
+            """Richardson iteration, which converges where the steps themselves do."""
+
+            def unfinished(state):
+                _, size, count = state
+                return (size > tolerance * jnp.abs(right).max()) & (count < max_steps)
+
+            def again(state):
+                x, _, count = state
+                residual = right - matvec(x)
+                return x + residual, jnp.abs(residual).max(), count + 1
+
+            start = (right, jnp.abs(right).max(), jnp.int32(0))
+            return jax.lax.while_loop(unfinished, again, start)[0]
+
+        tangent = jax.lax.custom_linear_solve(lambda v: v - slope(v), change, iterate, iterate)
+        return solution, tangent
+
+    return attach(jax.lax.stop_gradient(solution), parameters)
