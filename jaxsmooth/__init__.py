@@ -25,6 +25,9 @@ _HOMES = {
     "mesh.record": ("Labels", "Mesh"),
     "methods": ("METHODS", "Elastic", "Laplacian", "Method", "Optimize"),
     "methods.elastic.elasticity": ("Material",),
+    "methods.optimize.goals": ("Goal", "Stage"),
+    "methods.optimize.minimise": ("Minimiser",),
+    "metrics.evaluation": ("Evaluation", "evaluate"),
     "metrics.summary": ("Statistics", "statistics"),
     "metrics.table": ("METRICS", "quality", "quality_mean"),
     "motion.base": ("Motion",),
@@ -32,7 +35,8 @@ _HOMES = {
     "motion.planar": ("Constraints",),
     "runs.batch": ("Batch", "stack"),
     "runs.driver": ("SmoothResult", "smooth"),
-    "runs.pure": ("FixedPoint", "fixed_point", "run", "step"),
+    "runs.pure": ("FixedPoint", "Run", "fixed_point", "run", "step"),
+    "targets": ("FreeSize", "GivenSize", "OwnSize", "Target"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = sorted(_HOME)
@@ -48,6 +52,9 @@ if TYPE_CHECKING:
     from jaxsmooth.mesh.record import Labels, Mesh
     from jaxsmooth.methods import METHODS, Elastic, Laplacian, Method, Optimize
     from jaxsmooth.methods.elastic.elasticity import Material
+    from jaxsmooth.methods.optimize.goals import Goal, Stage
+    from jaxsmooth.methods.optimize.minimise import Minimiser
+    from jaxsmooth.metrics.evaluation import Evaluation, evaluate
     from jaxsmooth.metrics.summary import Statistics, statistics
     from jaxsmooth.metrics.table import METRICS, quality, quality_mean
     from jaxsmooth.motion.base import Motion
@@ -55,7 +62,8 @@ if TYPE_CHECKING:
     from jaxsmooth.motion.planar import Constraints
     from jaxsmooth.runs.batch import Batch, stack
     from jaxsmooth.runs.driver import SmoothResult, smooth
-    from jaxsmooth.runs.pure import FixedPoint, fixed_point, run, step
+    from jaxsmooth.runs.pure import FixedPoint, Run, fixed_point, run, step
+    from jaxsmooth.targets import FreeSize, GivenSize, OwnSize, Target
 
 
 def __getattr__(name: str):

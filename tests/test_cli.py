@@ -253,7 +253,7 @@ def test_the_help_names_every_method():
 
 def test_the_help_says_the_defaults():
     from jaxsmooth.cli import _GOALS, _parser
-    from jaxsmooth.methods.optimize.method import GOALS
+    from jaxsmooth.methods.optimize.goals import GOALS
 
     assert list(GOALS) == list(_GOALS)
     (commands,) = (a.choices for a in _parser()._actions if a.choices)

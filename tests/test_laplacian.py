@@ -17,7 +17,7 @@ from jaxsmooth.runs.driver import smooth
 
 EXACT = 1e-12  # float64, meshes of unit size
 evaluated = jax.jit(evaluate)
-stepped = jax.jit(lambda method, mesh, held, before: method.step(mesh, held, before))
+stepped = jax.jit(lambda method, mesh, held, before, state: method.step(mesh, held, before, state))
 
 
 def grid(kind, cells=3, amplitude=0.3, seed=0):
@@ -130,7 +130,7 @@ KINDS = ("triangle", "quad", "tetra", "wedge", "hexahedron", "triangle6", "quad8
 def test_classical_displacement(kind):
     mesh = grid(kind, cells=2)
     held = detect_constraints(mesh)
-    move = Laplacian().prepare(mesh).propose(mesh, held, evaluated(mesh)).move
+    move = Laplacian().propose(mesh, held, evaluated(mesh), Laplacian().init(mesh)).move
     near = neighbours(mesh)
     expected = np.array([classical(mesh, n, near) for n in range(len(mesh.points))])
     expected = np.einsum("nij,nj->ni", held.projectors, expected)
@@ -161,10 +161,11 @@ def test_smart_step_is_the_reference(kind, weights):
         kind, cells=3 if meshes.dim_of(kind) == 2 else 2, amplitude=0.2 if kind == "triangle6" else 0.35
     )
     held = detect_constraints(mesh)
-    method = Laplacian(smart=True, weighted=weights).prepare(mesh)
+    method = Laplacian(smart=True, weighted=weights)
     before = evaluated(mesh)
-    move = np.asarray(method.propose(mesh, held, before).move)
-    step = stepped(method, mesh, held, before)
+    state = method.init(mesh)
+    move = np.asarray(method.propose(mesh, held, before, state).move)
+    step = stepped(method, mesh, held, before, state)
     np.testing.assert_allclose(step.points, smart_reference(mesh, move), atol=EXACT)
     after = evaluated(mesh.with_points(step.points))
     np.testing.assert_allclose(step.evaluation.quality[0], after.quality[0], atol=EXACT)
@@ -225,7 +226,7 @@ def test_a_symmetric_mesh_stays_symmetric():
 
 def test_preparation_is_asked_for():
     mesh = grid("triangle", cells=2)
-    with pytest.raises(ValueError, match="prepare"):
+    with pytest.raises(ValueError, match="init"):
         Laplacian().propose(mesh, detect_constraints(mesh), evaluated(mesh))
 
 
@@ -240,11 +241,12 @@ def test_methods_table():
 def test_derivative_of_a_step():
     mesh = grid("triangle", cells=2)
     held = detect_constraints(mesh)
-    method = Laplacian(smart=True).prepare(mesh)
+    method = Laplacian(smart=True)
+    state = method.init(mesh)
 
     def total(points):
         here = mesh.with_points(points)
-        return (stepped(method, here, held, evaluated(here)).points ** 2).sum()
+        return (stepped(method, here, held, evaluated(here), state).points ** 2).sum()
 
     direction = np.random.default_rng(1).normal(size=mesh.points.shape)
     slope = (jax.grad(total)(mesh.points) * direction).sum()

@@ -19,13 +19,15 @@ from jaxsmooth.methods.optimize.distortion import (
     positive_part,
     regularisation,
 )
-from jaxsmooth.methods.optimize.method import GOALS, Optimize
+from jaxsmooth.methods.optimize.goals import GOALS, Goal, Stage
+from jaxsmooth.methods.optimize.method import Optimize
 from jaxsmooth.methods.optimize.minimise import Jaxopt, Newton, Optax, Optimistix
 from jaxsmooth.methods.optimize.problem import Aggregation, problem
 from jaxsmooth.metrics.evaluation import evaluate
 from jaxsmooth.metrics.table import shape_quality
 from jaxsmooth.motion.detect import detect_constraints
 from jaxsmooth.motion.planar import Constraints
+from jaxsmooth.targets import GivenSize, OwnSize
 
 jax.config.update("jax_enable_x64", True)
 
@@ -312,16 +314,18 @@ def test_given_size_pulls_measures_together():
         areas = np.asarray(evaluate(run(mesh, held, method)).jacobian[0])
         return areas.std() / areas.mean()
 
-    given = Optimize(target="given size", size=1 / 72, size_weight=10.0, start=None)
-    own = Optimize(target="own size", size_weight=100.0, start=None)
+    given = Optimize(target=GivenSize(size=1 / 72, weight=10.0), start=None)
+    own = Optimize(target=OwnSize(weight=100.0), start=None)
     assert spread(given) < spread(own)
 
 
 def test_options_are_checked():
-    with pytest.raises(ValueError, match="goal"):
+    with pytest.raises(ValueError, match="goal must be a Goal, or one of average, worst, bal"):
         Optimize(goal="best")
-    with pytest.raises(ValueError, match="size"):
-        Optimize(target="given size")
+    with pytest.raises(ValueError, match="neither repairs nor untangles"):
+        Goal((Stage(1, 1, 2, repairing=True),))
+    with pytest.raises(ValueError, match="metric"):
+        Optimize(metric="beauty")
 
 
 @pytest.mark.parametrize("name", ["wedge", "pyramid", "tetra10", "hexahedron20"])

@@ -20,8 +20,9 @@ from jaxsmooth.cells.table import ElementType
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.methods.elastic.elasticity import Material, element_force, linearise
 from jaxsmooth.methods.elastic.fitting import target_element
-from jaxsmooth.methods.elastic.method import target_measures
 from jaxsmooth.motion.detect import detect_constraints
+from jaxsmooth.numerics.small import Frame
+from jaxsmooth.targets import OwnSize
 
 __all__ = ["box_plot", "draw", "forces", "histogram", "mesh_row", "paper_figures"]
 
@@ -66,7 +67,7 @@ def forces(mesh: Mesh) -> np.ndarray:
 @jax.jit
 def _forces(mesh: Mesh, projectors: jax.Array) -> jax.Array:
     total = jnp.zeros_like(mesh.points)
-    for (kind, nodes), size in zip(mesh.blocks, target_measures(mesh), strict=True):
+    for (kind, nodes), size in zip(mesh.blocks, OwnSize().measures(mesh, Frame.of(mesh.points)), strict=True):
         corners = gather(mesh.points, nodes)
         ideal = jnp.asarray(kind.ideal, corners.dtype)
         target = jax.vmap(target_element, in_axes=(None, 0, 0))(ideal, corners, size ** (1 / kind.dim))

@@ -181,7 +181,8 @@ def to_meshio(
 
 
 def as_mesh(anything: Any) -> Mesh:
-    """A `Mesh` from whatever is one: `Mesh`, `MeshFile`, `meshio.Mesh`, ``(points, {"tetra": nodes})``.
+    """A `Mesh` from whatever is one or has one: `Mesh`, `MeshFile`, what `smooth` and `run` return,
+    `meshio.Mesh`, ``(points, {"tetra": nodes})``.
 
     A `Mesh` comes back as it is, its points traced by JAX or not; all else is read as files are, so
     that reversed elements are turned, and nodes that belong together are held.
@@ -191,8 +192,8 @@ def as_mesh(anything: Any) -> Mesh:
     """
     if isinstance(anything, Mesh):
         return anything
-    if isinstance(anything, MeshFile):
-        return anything.mesh
+    if isinstance(found := getattr(anything, "mesh", None), Mesh):
+        return found
     if isinstance(anything, meshio.Mesh):
         return from_meshio(anything).mesh
     if isinstance(anything, (tuple, list)) and len(anything) == 2:

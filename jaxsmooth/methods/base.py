@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -44,13 +44,20 @@ class Step(NamedTuple):
 class Method(eqx.Module):
     """How one step is made: a method proposes a displacement, its guard accepts what is fit.
 
-    A new method is a subclass with `propose`, and a line in the table of methods.
+    A new method is a subclass with `propose`; a line in the table of methods gives it a name.
     """
 
     guard: eqx.AbstractVar[Guard | None]
 
-    def prepare(self, mesh: Mesh) -> Method:
-        """Host-side work on the topology, done once before the first step; by default none."""
+    def init(self, mesh: Mesh) -> Any:
+        """What the steps need to know of the topology: a pytree that is passed along; by default None.
+
+        Host-side work, done once before the first step.
+        """
+        return None
+
+    def loosely(self) -> Method:
+        """The method as `smooth` uses it, which looks at every step and needs no exact ones."""
         return self
 
     @property
@@ -80,12 +87,19 @@ class Method(eqx.Module):
         return eqx.tree_at(lambda method: method.guard, self, replace(self.guard, **numbers))
 
     @abc.abstractmethod
-    def propose(self, mesh: Mesh, motion: Motion, before: Evaluation) -> Proposal:
-        """A displacement of all nodes within the constraints."""
+    def propose(self, mesh: Mesh, motion: Motion, before: Evaluation, state: Any = None) -> Proposal:
+        """An admissible displacement of all nodes.
 
-    def step(self, mesh: Mesh, motion: Motion, before: Evaluation) -> Step:
+        Args:
+            mesh: the mesh.
+            motion: what its nodes may do.
+            before: the evaluation of the mesh.
+            state: what `init` has made.
+        """
+
+    def step(self, mesh: Mesh, motion: Motion, before: Evaluation, state: Any = None) -> Step:
         """Propose and guard: pure, jittable and differentiable in points and parameters."""
-        proposal = self.propose(mesh, motion, before)
+        proposal = self.propose(mesh, motion, before, state)
         if self.guard is None:
             points = motion.retract(mesh.points, proposal.move)
             after = evaluate(mesh.with_points(points))

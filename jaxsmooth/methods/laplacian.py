@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -36,36 +36,32 @@ class Laplacian(Method):
         smart: a node moves only if the least quality of its patch rises (see `SmartGuard`).
         weighted: centroids of the attached elements, weighted by their measure (Eq. 38), in
             place of the connected nodes (Eq. 37).
-        pairs: connected nodes ``[pairs, 2]``, every pair once; `prepare` finds them.
         guard: the rule of the smart forms; the plain ones take every move.
     """
 
     smart: bool = eqx.field(static=True, default=False)
     weighted: bool = eqx.field(static=True, default=False)
-    pairs: Int[Array, "pairs 2"] | None = None
     guard: Guard | None = eqx.field(init=False)
 
     def __post_init__(self):
         self.guard = SmartGuard() if self.smart else None
 
-    def prepare(self, mesh: Mesh) -> Laplacian:
-        """Find the connected nodes: elements share edges, and Eq. 37 counts a neighbour once."""
-        if self.weighted:
-            return self
-        return replace(self, pairs=jnp.asarray(node_pairs(mesh), jnp.int32))
+    def init(self, mesh: Mesh) -> Int[Array, "pairs 2"] | None:
+        """The connected nodes, every pair once: elements share edges, and Eq. 37 counts a neighbour once."""
+        return None if self.weighted else jnp.asarray(node_pairs(mesh), jnp.int32)
 
-    def propose(self, mesh: Mesh, motion: Motion, before: Evaluation) -> Proposal:
+    def propose(self, mesh: Mesh, motion: Motion, before: Evaluation, state: Any = None) -> Proposal:
         """The displacement of Eq. 37 or 38, projected onto the free directions of each node."""
-        move = self._to_centroids(mesh) if self.weighted else self._to_neighbours(mesh)
+        move = self._to_centroids(mesh) if self.weighted else self._to_neighbours(mesh, state)
         move = motion.at(mesh.points).project(move)
         return Proposal(move, jnp.int32(0), jnp.zeros((), move.dtype))
 
-    def _to_neighbours(self, mesh: Mesh) -> Field:
-        if self.pairs is None:
-            raise ValueError("the connected nodes are not known yet; use Laplacian(...).prepare(mesh)")
-        ends = jnp.flip(gather(mesh.points, self.pairs), axis=1)
-        ones = jnp.ones((*self.pairs.shape, 1), ends.dtype)
-        total = scatter_add(jnp.concatenate([ends, ones], axis=-1), self.pairs, len(mesh.points))
+    def _to_neighbours(self, mesh: Mesh, pairs: Int[Array, "pairs 2"] | None) -> Field:
+        if pairs is None:
+            raise ValueError("the connected nodes are not known; pass the state that init(mesh) has made")
+        ends = jnp.flip(gather(mesh.points, pairs), axis=1)
+        ones = jnp.ones((*pairs.shape, 1), ends.dtype)
+        total = scatter_add(jnp.concatenate([ends, ones], axis=-1), pairs, len(mesh.points))
         return _mean(total, mesh.points)
 
     def _to_centroids(self, mesh: Mesh) -> Field:

@@ -60,7 +60,6 @@ def block_inverse(
 
 
 _RESTARTS = 4
-_PATIENCE = 10  # times more iterations for a differentiated solve
 _ROUNDING = 4  # iterations a degree of freedom, where exact arithmetic needs one
 
 
@@ -148,9 +147,8 @@ def solve_projected(
 ) -> Solution:
     """Solve ``(TᵀK T + (I − P)) w = Tᵀf``, and return ``u = T w`` (Eq. 33 without its multipliers).
 
-    Under differentiation the system is solved to `gradient_tolerance`, and so is its
-    derivative: implicitly, by one more solve with the same operator and a projected
-    right-hand side.  The derivative of a loosely solved system would be that of nothing.
+    The derivative is implicit: one more solve with the same operator and a projected right-hand side, to the
+    same tolerance.  The derivative of a loosely solved system is that of nothing: see `gradient_tolerance`.
 
     Args:
         operator: ``u -> K u``, a pytree; it may hold differentiated values.
@@ -169,7 +167,7 @@ def solve_projected(
 
 
 def gradient_tolerance(dtype: Any) -> float:
-    """Relative residual to which differentiated systems are solved: 4e-10, or 7e-5 in float32."""
+    """Relative residual that derivatives need: 4e-10, or 7e-5 in float32."""
     return float(jnp.finfo(dtype).eps) ** 0.6
 
 
@@ -184,17 +182,16 @@ def _solve(system, tolerance, max_iterations) -> Solution:
 def _solve_jvp(primals, tangents):
     """With A w = b:  A dw = db − dA w."""
     system, tolerance, max_iterations = primals
-    tight = jnp.minimum(tolerance, gradient_tolerance(system[-1].dtype))
-    solution = _solve(system, tight, _PATIENCE * max_iterations)
+    solution = _solve(system, tolerance, max_iterations)
     # saved under this name, a rematerialised step need not solve again
     field = checkpoint_name(solution.field, "displacement")
 
     def residual(system):
-        matvec, right, _ = _equations(system, tight, max_iterations)
+        matvec, right, _ = _equations(system, tolerance, max_iterations)
         return right - matvec(field)
 
     _, change = jax.jvp(residual, (system,), tangents[:1])
-    matvec, _, solver = _equations(system, tight, _PATIENCE * max_iterations)
+    matvec, _, solver = _equations(system, tolerance, max_iterations)
     slope, _ = jax.lax.custom_linear_solve(matvec, change, solver, symmetric=True, has_aux=True)
     iterations = np.zeros((), jax.dtypes.float0)
     return solution._replace(field=field), Solution(slope, iterations, jnp.zeros_like(solution.residual))

@@ -35,7 +35,7 @@ class Batch(eqx.Module):
     mesh: Mesh
     constraints: Constraints
     nodes: Bool[Array, "batch nodes"]
-    elements: tuple[Bool[Array, "batch elements"], ...]
+    elements: tuple[Bool[Array, "_ _"], ...]
 
     def points(self, mesh: Mesh | None = None) -> list[Float[Array, "nodes dim"]]:
         """The points of each mesh without ghosts, of `mesh` or of the batch itself."""
@@ -43,7 +43,7 @@ class Batch(eqx.Module):
         counts = np.asarray(self.nodes).sum(axis=1)
         return [points[i, :count] for i, count in enumerate(counts)]
 
-    def mean(self, values: tuple[Float[Array, "batch elements"], ...]) -> Float[Array, " batch"]:
+    def mean(self, values: tuple[Float[Array, "_ _"], ...]) -> Float[Array, " _"]:
         """Mean over the real elements of each mesh, of values given block by block."""
         total = sum(jnp.where(m, v, 0).sum(axis=1) for m, v in zip(self.elements, values, strict=True))
         return total / sum(m.sum(axis=1) for m in self.elements)

@@ -52,22 +52,27 @@ class SmoothResult:
 
     Attributes:
         mesh: the smoothed mesh.
-        quality: shape quality, one array ``[elements]`` a block.
+        evaluation: what its elements are worth.
         history: a `StepRecord` for the input and for every step.
         status: why the run ended.
         constraints: the constraints that were used.
     """
 
     mesh: Mesh
-    quality: tuple[Float[Array, " _"], ...]
+    evaluation: Evaluation
     history: tuple[StepRecord, ...]
     status: Status
     constraints: Motion
 
+    @property
+    def quality(self) -> tuple[Float[Array, " _"], ...]:
+        """Shape quality, one array ``[elements]`` a block."""
+        return self.evaluation.quality
+
 
 @jax.jit
-def _step(method: Method, mesh: Mesh, motion: Motion, before: Evaluation):
-    return method.step(mesh, motion, before)
+def _step(method: Method, mesh: Mesh, motion: Motion, before: Evaluation, state: Any):
+    return method.step(mesh, motion, before, state)
 
 
 def smooth(
@@ -110,7 +115,8 @@ def smooth(
             "smooth decides on the host when to stop, so JAX can't trace it; inside jit, grad or vmap use "
             "run(mesh, method, constraints=constraints, steps=3), with constraints found beforehand"
         )
-    method = (Elastic() if method is None else method).prepare(mesh)
+    method = (Elastic() if method is None else method).loosely()
+    state = method.init(mesh)
     constraints = detect_constraints(mesh) if constraints is None else constraints
     _check(mesh, constraints, steps)
     accept = method.acceptance if accept is None else accept
@@ -119,84 +125,122 @@ def smooth(
     start = time.perf_counter()
     evaluation = evaluated(mesh)
     first = StepRecord(0, statistics(mesh, evaluation), seconds=time.perf_counter() - start)
-    driver = _Driver(constraints, accept, (tolerance_avg, tolerance_min), callback)
-    driver.record(first)
-    (mesh, evaluation), status = driver.run(method, mesh, evaluation, steps)
-    return SmoothResult(
-        mesh.with_labels(labels), evaluation.quality, tuple(driver.history), status, constraints
-    )
+    tolerances = (tolerance_avg, tolerance_min)
+    place = _Place(mesh, evaluation, first)
+    driver = _Driver(method, constraints, state, accept, tolerances, callback, place)
+    status = driver.run(steps)
+    end, history = driver.reached, tuple(driver.history)
+    return SmoothResult(end.mesh.with_labels(labels), end.evaluation, history, status, constraints)
 
 
 _PATIENCE = 3  # steps without change after which a mesh is taken to stay tangled
 _EXCURSION = 2  # steps that may break the rule, and untangle nothing, before one that meets it again
 
 
+@dataclass(frozen=True)
+class _Place:
+    """A mesh on the way, its evaluation, and its row of the history."""
+
+    mesh: Mesh
+    evaluation: Evaluation
+    row: StepRecord
+
+    @property
+    def now(self) -> Statistics:
+        return self.row.statistics
+
+
 @dataclass
 class _Driver:
-    """The loop of `smooth`; `history` has the steps that count."""
+    """The loop of `smooth`.
 
-    constraints: Motion
+    Attributes:
+        reached: the last place that counts: the result, if nothing better comes.
+        waiting: places after it that do not count, unless one after them does.
+        attempts: the method with guards that are tried one after another.
+        refused: why the last attempt led nowhere.
+    """
+
+    method: Method
+    motion: Motion
+    state: Any
     accept: AcceptanceRule
     tolerances: tuple[float, float]
     callback: Callable[[StepRecord], None] | None
+    reached: _Place
     history: list[StepRecord] = field(default_factory=list)
+    waiting: list[_Place] = field(default_factory=list)
+    attempts: list[Method] = field(default_factory=list)
+    refused: Status | None = None
 
-    def record(self, row: StepRecord) -> None:
-        """One more step that counts."""
+    def run(self, steps: int) -> Status:
+        """Make the steps; where they lead nowhere, go back and on with the stricter method."""
+        self._record(self.reached.row)
+        self.attempts = list(self.method.attempts(tangled=self.reached.now.inverted > 0))
+        settled = lost = 0
+        while (index := len(self.history) + len(self.waiting)) <= steps:
+            before = (self.waiting or [self.reached])[-1]
+            place = self._advance(before, index)
+            if isinstance(place, Status):
+                return place
+            now = place.now
+            still = not self.waiting and bool((place.mesh.points == before.mesh.points).all())
+            if still and self.refused is not None:
+                return self.refused
+            settled = settled + 1 if self._settled(before.now, now) else 0
+            done = still or settled >= (_PATIENCE if now.inverted else 1)
+            fewest = min(p.now.inverted for p in (self.reached, *self.waiting))
+            lost = 0 if now.inverted < fewest else lost + 1
+            self.waiting.append(place)
+            refusal = None if still else self._objection(place)
+            if refusal is None:
+                valid = self.reached.now.inverted and not now.inverted
+                self._accept()
+                lost = 0
+                if valid:
+                    self.attempts = list(self.method.attempts(tangled=False))
+                elif done:
+                    return Status.STALLED if still and place.row.shortened else Status.CONVERGED
+            elif done or lost > _EXCURSION or index == steps or self._ended(settled, refusal):
+                if len(self.attempts) == 1 or self._ended(settled, refusal):
+                    return Status.CONVERGED if settled else refusal
+                self.attempts, self.waiting, self.refused = self.attempts[1:], [], refusal
+                settled = lost = 0
+        return Status.STEP_LIMIT
+
+    def _advance(self, before: _Place, index: int) -> _Place | Status:
+        """One step of the present attempt, or why there is none."""
+        start = time.perf_counter()
+        step = _step(self.attempts[0], before.mesh, self.motion, before.evaluation, self.state)
+        if not bool(jnp.isfinite(step.points).all()):
+            return Status.NOT_FINITE if bool(jnp.isfinite(step.residual)) else Status.UNSOLVED
+        mesh = before.mesh.with_points(step.points)
+        now = statistics(mesh, step.evaluation)
+        counts = int(step.iterations), float(step.residual), int(step.shortened)
+        row = StepRecord(index, now, *counts, time.perf_counter() - start)
+        return _Place(mesh, step.evaluation, row)
+
+    def _accept(self) -> None:
+        """The last place counts, and with it those that led there."""
+        for place in self.waiting:
+            self._record(place.row)
+        self.reached, self.waiting, self.refused = self.waiting[-1], [], None
+
+    def _record(self, row: StepRecord) -> None:
         self.history.append(row)
         if self.callback is not None:
             self.callback(row)
 
-    def run(
-        self, method: Method, mesh: Mesh, evaluation: Evaluation, steps: int
-    ) -> tuple[tuple[Mesh, Evaluation], Status]:
-        """Make the steps; where they lead nowhere, go back and on with the stricter method.
+    def _objection(self, place: _Place) -> Status | None:
+        first, last = self.history[0].statistics, self.reached.now
+        rounding = 64 * float(jnp.finfo(place.mesh.points.dtype).eps)  # qualities are of order 1
+        return self.accept.objection(first, last, place.now, rounding)
 
-        Returns the mesh of the last step that counts, its evaluation, and why the run ended.
-        """
-        reached, refused = (mesh, evaluation), None
-        attempts = list(method.attempts(tangled=self.history[0].statistics.inverted > 0))
-        waiting: list[StepRecord] = []  # steps that do not count, unless one after them does
-        settled = lost = 0
-        while (index := len(self.history) + len(waiting)) <= steps:
-            start = time.perf_counter()
-            step = _step(attempts[0], mesh, self.constraints, evaluation)
-            if not bool(jnp.isfinite(step.points).all()):
-                return reached, Status.NOT_FINITE if bool(jnp.isfinite(step.residual)) else Status.UNSOLVED
-            still = bool((step.points == mesh.points).all()) and not waiting
-            mesh, evaluation = mesh.with_points(step.points), step.evaluation
-            now = statistics(mesh, evaluation)
-            counts = int(step.iterations), float(step.residual), int(step.shortened)
-            settled = settled + 1 if self._settled((waiting or self.history)[-1].statistics, now) else 0
-            done = still or settled >= (_PATIENCE if now.inverted else 1)
-            fewest = min(row.statistics.inverted for row in (self.history[-1], *waiting))
-            lost = 0 if now.inverted < fewest else lost + 1
-            waiting.append(StepRecord(index, now, *counts, time.perf_counter() - start))
-            refusal = None if still else self._objection(now, mesh)
-            if still and refused is not None:
-                return reached, refused
-            if refusal is None:
-                if self.history[-1].statistics.inverted and not now.inverted:
-                    attempts, done = list(method.attempts(tangled=False)), False
-                for row in waiting:
-                    self.record(row)
-                reached, waiting, lost = (mesh, evaluation), [], 0
-                if done:
-                    status = Status.STALLED if still and counts[2] else Status.CONVERGED
-                    return reached, status
-                refused = None
-            elif done or lost > _EXCURSION or index == steps:
-                last = self.history[-1].step > 0 and settled and len(waiting) == 1 and not now.inverted
-                if len(attempts) == 1 or last:
-                    return reached, Status.CONVERGED if settled else refusal
-                attempts, settled, refused = attempts[1:], 0, refusal
-                (mesh, evaluation), waiting, lost = reached, [], 0
-        return reached, Status.STEP_LIMIT
-
-    def _objection(self, now: Statistics, mesh: Mesh) -> Status | None:
-        first, last = self.history[0].statistics, self.history[-1].statistics
-        rounding = 64 * float(jnp.finfo(mesh.points.dtype).eps)  # qualities are of order 1
-        return self.accept.objection(first, last, now, rounding)
+    def _ended(self, settled: int, refusal: Status) -> bool:
+        """Whether a valid mesh that has improved improves no more: the first step from it brings nothing."""
+        first = len(self.waiting) == 1 and self.reached.row.step > 0
+        useless = bool(settled) or refusal is Status.NO_GAIN
+        return first and useless and not self.waiting[0].now.inverted
 
     def _settled(self, before: Statistics, now: Statistics) -> bool:
         """Whether a step has changed nothing that counts."""

@@ -16,71 +16,120 @@ from jaxtyping import Array, Float, Int
 from jaxsmooth.convert.meshfile import as_mesh
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.methods import Elastic, Method
-from jaxsmooth.metrics.evaluation import evaluate
+from jaxsmooth.metrics.evaluation import Evaluation, evaluate
 from jaxsmooth.motion.base import Motion
 
-__all__ = ["FixedPoint", "fixed_point", "run", "step"]
+__all__ = ["FixedPoint", "Run", "fixed_point", "run", "step"]
 
 Field = Float[Array, "nodes dim"]
 _UNNESTED = 16  # steps whose points alone are kept; more are nested, for memory ~ √steps
 
 
-def step(mesh: Any, method: Method, constraints: Motion) -> Mesh:
+def step(mesh: Any, method: Method, constraints: Motion, state: Any = None) -> Mesh:
     """One step of a method, ``mesh -> mesh``: the differentiable atom of all runs.
 
     Derivatives go through quality, fit, forces and the solve; the fractions of the moves that
-    the guard accepts are constants for them.
+    the guard accepts are constants for them.  `state` is what `method.init` has made; it is made here
+    where the connectivity is not traced.
     """
     mesh = as_mesh(mesh)
-    before = jax.lax.stop_gradient(evaluate(mesh))
-    return mesh.with_points(method.step(mesh, constraints, before).points)
+    state = _state(method, mesh) if state is None else state
+    return mesh.with_points(method.step(mesh, constraints, _before(mesh), state).points)
 
 
-def run(mesh: Any, method: Method | None = None, *, constraints: Motion, steps: int = 3) -> Mesh:
+def _before(mesh: Mesh) -> Evaluation:
+    return jax.lax.stop_gradient(evaluate(mesh))
+
+
+def _state(method: Method, mesh: Mesh) -> Any:
+    """The state of the method, where the connectivity is known on the host."""
+    traced = any(isinstance(nodes, jax.core.Tracer) for nodes in mesh.connectivity)
+    return None if traced else method.init(mesh)
+
+
+class Run(eqx.Module):
+    """What `run` returns.
+
+    Attributes:
+        mesh: the smoothed mesh.
+        evaluation: what its elements are worth.
+        residuals: true relative residual of the linear solve of every step ``[steps]``.
+        iterations: of the linear solver in every step ``[steps]``.
+        shortened: nodes whose move the guard shortened, in every step ``[steps]``.
+        least: the least bound of the Jacobian determinant, of the mesh scaled to about unit size: where it is
+            positive the mesh is valid.
+    """
+
+    mesh: Mesh
+    evaluation: Evaluation
+    residuals: Float[Array, " steps"]
+    iterations: Int[Array, " steps"]
+    shortened: Int[Array, " steps"]
+    least: Float[Array, ""]
+
+    @property
+    def points(self) -> Field:
+        """The points of the smoothed mesh."""
+        return self.mesh.points
+
+
+def run(
+    mesh: Any,
+    method: Method | None = None,
+    *,
+    constraints: Motion,
+    steps: int = 3,
+    state: Any = None,
+) -> Run:
     """A fixed number of steps.
 
     Reverse mode keeps, for every step, the points, the displacement and the guard's decision,
     and computes the rest again: memory hardly grows with the number of steps and not at all
-    with the iterations of the solver.  Under differentiation the linear systems are solved
-    tightly (`solve.gradient_tolerance`).
+    with the iterations of the solver.
 
     Args:
         mesh: a `Mesh`, whose points may be traced, batched, or both; or whatever else `as_mesh` takes.
-        method: `Elastic()` by default.
+        method: `Elastic()` by default, whose linear systems are solved as tightly as derivatives need.
         constraints: how nodes may move (found beforehand, from concrete points).
         steps: number of steps (static).
+        state: what `method.init` has made, for methods that need it, where the connectivity is traced.
 
     Returns:
-        The smoothed mesh.
+        The smoothed mesh, and what was done.
     """
     mesh = as_mesh(mesh)
-    method = _prepared(method, mesh)
+    method = Elastic() if method is None else method
+    state = _state(method, mesh) if state is None else state
     saved = jax.checkpoint_policies.save_only_these_names("displacement", "accepted")
+    dtype = mesh.points.dtype
+    nothing = jnp.zeros((), dtype), jnp.int32(0), jnp.int32(0)
 
-    def advance(points: Field, index: Int[Array, ""]) -> tuple[Field, None]:
-        def move(points: Field) -> Field:
-            return step(mesh.with_points(points), method, constraints).points
+    def advance(points: Field, index: Int[Array, ""]) -> tuple[Field, Any]:
+        def move(points: Field) -> tuple[Field, Any]:
+            here = mesh.with_points(points)
+            done = method.step(here, constraints, _before(here), state)
+            counts = jnp.asarray(done.residual, dtype), done.iterations, done.shortened.astype(jnp.int32)
+            return done.points, jax.lax.stop_gradient(counts)
 
-        return jax.lax.cond(index < steps, move, lambda p: p, points), None
+        return jax.lax.cond(index < steps, move, lambda p: (p, nothing), points)
 
     inner = steps if steps <= _UNNESTED else math.ceil(math.sqrt(steps))
     outer = -(-steps // max(inner, 1))
     one = jax.checkpoint(advance, policy=saved)
 
-    def several(points: Field, indices: Int[Array, " inner"]) -> tuple[Field, None]:
+    def several(points: Field, indices: Int[Array, " inner"]) -> tuple[Field, Any]:
         return jax.lax.scan(one, points, indices)
 
     if outer <= 1:
-        return mesh.with_points(several(mesh.points, jnp.arange(steps))[0])
-    indices = jnp.arange(outer * inner).reshape(outer, inner)
-    return mesh.with_points(jax.lax.scan(jax.checkpoint(several), mesh.points, indices)[0])
-
-
-def _prepared(method: Method | None, mesh: Mesh) -> Method:
-    """The method with its host-side work done, where the connectivity is known on the host."""
-    method = Elastic() if method is None else method
-    traced = any(isinstance(nodes, jax.core.Tracer) for nodes in mesh.connectivity)
-    return method if traced else method.prepare(mesh)
+        points, counts = several(mesh.points, jnp.arange(steps))
+    else:
+        indices = jnp.arange(outer * inner).reshape(outer, inner)
+        points, counts = jax.lax.scan(jax.checkpoint(several), mesh.points, indices)
+        counts = jax.tree.map(lambda part: part.reshape(-1)[:steps], counts)
+    mesh = mesh.with_points(points)
+    evaluation = evaluate(mesh)
+    least = jnp.stack([part.min() for part in evaluation.jacobian]).min()
+    return Run(mesh, evaluation, *counts, least)
 
 
 class FixedPoint(eqx.Module):
@@ -123,7 +172,8 @@ def fixed_point(
         The mesh, the number of steps and the last change: compare it with `tolerance`.
     """
     mesh = as_mesh(mesh)
-    method = _prepared(method, mesh)
+    method = Elastic() if method is None else method
+    state = _state(method, mesh)
     method = eqx.tree_at(lambda m: m.guard, method, None, is_leaf=lambda x: x is None)
     stopped = jax.lax.stop_gradient
     points = mesh.points
@@ -133,7 +183,7 @@ def fixed_point(
         return motion.retract(points, motion.at(points).expand(u))
 
     def displaced(u: Field, method: Method, points: Field, motion: Motion) -> Field:
-        after = step(mesh.with_points(place(u, points, motion)), method, motion).points
+        after = step(mesh.with_points(place(u, points, motion)), method, motion, state).points
         return motion.at(points).independent(after - points)
 
     def search(u: Field):
@@ -148,7 +198,6 @@ def fixed_point(
             new = displaced(u, *fixed)
             return new, jnp.abs(new - u).max() / extent, count + 1
 
-        # jvp makes the steps solve as tightly as their derivative does
         return jax.lax.while_loop(unfinished, again, (u, jnp.asarray(jnp.inf, u.dtype), jnp.int32(0)))
 
     u, change, count = search(jnp.zeros_like(points))

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxsmooth.assembly import cut, gather, scatter_add
 from jaxsmooth.guards.acceptance import AcceptanceRule
@@ -23,10 +24,12 @@ from jaxsmooth.metrics.evaluation import Evaluation
 from jaxsmooth.metrics.table import shape_quality
 from jaxsmooth.motion.base import Motion
 from jaxsmooth.numerics.small import Frame, least
-from jaxsmooth.numerics.solve import solve_projected
-from jaxsmooth.targets import target_measures
+from jaxsmooth.numerics.solve import gradient_tolerance, solve_projected
+from jaxsmooth.targets import OwnSize, Target
 
 __all__ = ["Elastic"]
+
+_LOOSE, _FEW = 3e-2, 1000  # residual and iterations of a step that is looked at
 
 
 class Elastic(Method):
@@ -36,20 +39,23 @@ class Elastic(Method):
         extended: weigh the element forces by (1 − q) / (1 − q_min) (Eq. 35).
         alpha: reduction factor of the target elements (Eq. 36).
         beta: exponent of the quality in the weights of the extended method (Eqs. 1, 2).
+        target: the size of the ideal elements, before alpha.
         material: Young's modulus and Poisson's ratio of the elements.
         guard: the patch guard (Eq. 34), or None for the full step.
-        tolerance: relative residual of the linear system.  The mesh does not profit from a
-            tight one; verification and gradients do.
+        tolerance: relative residual of the linear system, of its solution and of its derivative.  By default
+            `gradient_tolerance`; in `smooth`, which looks at every step, 0.03: a mesh does not profit from
+            exact steps, derivatives do.
         max_iterations: bound on the iterations of the solver.
     """
 
     extended: bool = eqx.field(static=True, default=False)
     alpha: Float[Array, ""] | float = 1.0
     beta: Float[Array, ""] | float = 2.0
+    target: Target = OwnSize()
     material: Material = Material()
     guard: Guard | None = PatchGuard()
-    tolerance: float = 3e-2
-    max_iterations: int = 1000
+    tolerance: Float[Array, ""] | float | None = None
+    max_iterations: Int[Array, ""] | int = 10_000
 
     @property
     def acceptance(self) -> AcceptanceRule:
@@ -57,7 +63,11 @@ class Elastic(Method):
         rule = super().acceptance
         return replace(rule, average=math.inf) if self.extended else rule
 
-    def propose(self, mesh: Mesh, motion: Motion, before: Evaluation) -> Proposal:
+    def loosely(self) -> Elastic:
+        """With loose linear systems, unless a tolerance has been chosen."""
+        return self if self.tolerance is not None else replace(self, tolerance=_LOOSE, max_iterations=_FEW)
+
+    def propose(self, mesh: Mesh, motion: Motion, before: Evaluation, state: Any = None) -> Proposal:
         """Solve K U = F (Eqs. 31–36) in the null space of the constraints."""
         frame = Frame.of(mesh.points)
         mesh, motion = mesh.with_points(frame.into(mesh.points)), motion.within(frame)
@@ -65,7 +75,8 @@ class Elastic(Method):
         force = jnp.zeros_like(mesh.points)
         blocks = []
         weights = self.priorities(mesh) if self.extended else (None,) * len(mesh.blocks)
-        for (kind, nodes), weight, size in zip(mesh.blocks, weights, target_measures(mesh), strict=True):
+        sizes = self.target.measures(mesh, frame)
+        for (kind, nodes), weight, size in zip(mesh.blocks, weights, sizes, strict=True):
             corners = gather(mesh.points, nodes)
             ideal = jnp.asarray(kind.ideal, corners.dtype)
             scale = self.alpha * size ** (1 / kind.dim)
@@ -82,7 +93,7 @@ class Elastic(Method):
             operator.diagonal(count),
             motion.at(mesh.points),
             force,
-            self.tolerance,
+            gradient_tolerance(force.dtype) if self.tolerance is None else self.tolerance,
             self.max_iterations,
         )
         return Proposal(found.field / frame.scale, found.iterations, found.residual)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,47 +17,20 @@ from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.methods.base import Method, Proposal
 from jaxsmooth.methods.elastic.method import Elastic
 from jaxsmooth.methods.optimize.distortion import METRICS
+from jaxsmooth.methods.optimize.goals import BALANCED, GOALS, UNTANGLE, Goal
 from jaxsmooth.methods.optimize.minimise import Minimiser, Newton
 from jaxsmooth.methods.optimize.problem import Aggregation, Problem, problem
 from jaxsmooth.metrics.evaluation import Evaluation, evaluate
 from jaxsmooth.metrics.summary import POOR
 from jaxsmooth.motion.base import Motion
 from jaxsmooth.numerics.small import Frame
-from jaxsmooth.targets import target_measures
+from jaxsmooth.targets import FreeSize, OwnSize, Target
 
-__all__ = ["GOALS", "Optimize", "Stage"]
-
-TARGETS = ("free size", "own size", "given size")
-
-
-class Stage(NamedTuple):
-    """One minimisation: weights of the average and of the worst elements, and the power of the latter.
-
-    One that is `untangling` is left out when the mesh is valid, one that is `repairing` unless the worst
-    element is worse than at the start; that element is then the pivot.
-    """
-
-    average: float
-    worst: float
-    power: float
-    untangling: bool = False
-    repairing: bool = False
-
+__all__ = ["Optimize"]
 
 _VALID = PatchGuard(gamma=0.0, poor=0.0, corner=0.0)  # only against inversion
 _PATIENCE = 4  # untangling stages without success
-_UNTANGLE = Stage(0, 1, 2, untangling=True)  # unlike the mean of 1 − q, it grows without bound
-_REPAIR = Stage(1, 30, 32, repairing=True)
 _SLACK = 1.0002  # a rise of the largest e that needs no repair
-# What a user wants, as minimisations one after another (see `Aggregation`).
-GOALS: dict[str, tuple[Stage, ...]] = {
-    # the mean of 1 − q, with a light hand on the worst elements; twice for the iterations
-    "average": (Stage(1, 0.1, 4), Stage(1, 0.1, 4)),
-    # a p-norm of 1/q that comes ever closer to the maximum
-    "worst": (Stage(0, 1, 4), Stage(0, 1, 8), Stage(0, 1, 16)),
-    # the mean of 1 − q, and a penalty on what is worse than the pivot, then than the worst at the start
-    "balanced": (Stage(1, 1, 4), Stage(1, 2, 8), _REPAIR),
-}
 
 
 class _State(NamedTuple):
@@ -67,17 +42,20 @@ class _State(NamedTuple):
     waited: Int[Array, ""]
 
 
+def _goal(value: Goal | str) -> Goal:
+    if isinstance(value, str) and value not in GOALS:
+        raise ValueError(f"goal must be a Goal, or one of {', '.join(GOALS)}; got {value!r}")
+    return GOALS[value] if isinstance(value, str) else value
+
+
 class Optimize(Method):
     """Maximise the quality of all elements, starting from the elastic method's mesh.
 
     Attributes:
-        goal: ``"average"``, ``"worst"`` or ``"balanced"``: the best mean quality, the best of
-            the poor elements, or both; see `GOALS`.
+        goal: `AVERAGE`, `WORST` or `BALANCED`, or one of your own; a name of `GOALS` will do.
         metric: ``"shape"``, the paper's q where its optimum is the ideal element, both for wedges,
             pyramids and quadratic elements, or ``"mean_ratio"`` for all.
-        target: ``"free size"``, ``"own size"`` (the paper's) or ``"given size"``.
-        size: for a given size, the measure of the target elements: a number, or one array a block.
-        size_weight: how much the size counts beside the shape, unless it is free.
+        target: `FreeSize`, `OwnSize` (the paper's) or `GivenSize`.
         pivot: of n elements, ``pivot · √n`` count as poor: the value of the next is the pivot of
             the aggregation.
         minimiser: how the objective is reduced.
@@ -91,11 +69,9 @@ class Optimize(Method):
     A step is a whole optimisation; another one goes on from there.  It is not differentiable in reverse mode.
     """
 
-    goal: str = eqx.field(static=True, default="balanced")
+    goal: Goal = eqx.field(static=True, converter=_goal, default=BALANCED)
     metric: str = eqx.field(static=True, default="shape")
-    target: str = eqx.field(static=True, default="free size")
-    size: tuple[Float[Array, " _"], ...] | Float[Array, ""] | float | None = None
-    size_weight: Float[Array, ""] | float = 1.0
+    target: Target = FreeSize()
     pivot: Float[Array, ""] | float = 0.5
     minimiser: Minimiser = Newton()
     start: Method | None = Elastic(tolerance=0.1)
@@ -105,11 +81,14 @@ class Optimize(Method):
     guard: Guard | None = _VALID
 
     def __check_init__(self):
-        for name, known in (("goal", GOALS), ("metric", METRICS), ("target", TARGETS)):
-            if getattr(self, name) not in known:
-                raise ValueError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
-        if (self.target == "given size") != (self.size is not None):
-            raise ValueError("size goes with target='given size', and only with it")
+        if self.metric not in METRICS:
+            raise ValueError(f"metric must be one of {', '.join(METRICS)}, got {self.metric!r}")
+
+    @property
+    def acceptance(self) -> AcceptanceRule:
+        """A goal that knows the worst elements alone gives some of the average quality for them."""
+        rule = super().acceptance
+        return rule if self.goal.averaged else replace(rule, average=math.inf)
 
     def attempts(self, tangled: bool) -> tuple[Method, ...]:
         """The objective is trusted first, for it has a barrier of its own; then as for other methods."""
@@ -118,13 +97,13 @@ class Optimize(Method):
         usual = {"poor": POOR, "corner": PatchGuard().corner}
         return (self, self._looser()[0], self._guarded(**usual), self._guarded(**usual, keep=1.0))
 
-    def propose(self, mesh: Mesh, motion: Motion, before: Evaluation) -> Proposal:
+    def propose(self, mesh: Mesh, motion: Motion, before: Evaluation, state: Any = None) -> Proposal:
         """The displacement to the optimised mesh."""
         mesh, motion = jax.lax.stop_gradient((mesh, motion))
         frame = Frame.of(mesh.points)
         mesh, motion = mesh.with_points(frame.into(mesh.points)), motion.within(frame)
-        sizes = self._sizes(mesh, frame.scale)
-        stages = (_UNTANGLE,) * self.untangling_stages + GOALS[self.goal]
+        sizes = (self.target if self.target.sized else OwnSize()).measures(mesh, frame)  # as units, if free
+        stages = (UNTANGLE,) * self.untangling_stages + self.goal.stages
         stages = jax.tree.map(lambda *values: jnp.stack([jnp.asarray(v) for v in values]), *stages)
         zero = jnp.zeros((), mesh.points.dtype)
 
@@ -133,11 +112,11 @@ class Optimize(Method):
             task = self._problem(mesh, motion, sizes, aggregation)
             return eqx.tree_at(lambda t: t.aggregation.pivot, task, self._pivot(task, points))
 
-        judge = task_of(next(s for s in reversed(GOALS[self.goal]) if not s.repairing), mesh.points)
+        judge = task_of(self.goal.last, mesh.points)
         hopeless = judge.hopeless(mesh.points)
         # the start is for meshes that it helps: an optimised one goes on where it is
         value, least = judge.value(mesh.points, zero)
-        begun = self._begin(mesh, motion, before)
+        begun = self._begin(mesh, motion, before, state)
         helped = (judge.value(begun, zero)[0] < value) | (least <= 0)
         start = mesh.with_points(jnp.where(helped, begun, mesh.points))
         worst = _ordered(judge, start.points)[-1]
@@ -175,7 +154,11 @@ class Optimize(Method):
         move = jnp.where(finite, end.points - mesh.points, 0)
         return Proposal(move / frame.scale, end.iterations, zero)
 
-    def _begin(self, mesh: Mesh, motion: Motion, before: Evaluation) -> Float[Array, "nodes dim"]:
+    def init(self, mesh: Mesh) -> Any:
+        """The state of the starting method."""
+        return None if self.start is None else self.start.init(mesh)
+
+    def _begin(self, mesh: Mesh, motion: Motion, before: Evaluation, state: Any) -> Float[Array, "nodes dim"]:
         """The points after the steps of the starting method."""
         if self.start is None:
             return mesh.points
@@ -187,25 +170,13 @@ class Optimize(Method):
 
         def step(carry):
             points, before, count = carry
-            found = self.start.step(mesh.with_points(points), motion, before)
+            found = self.start.step(mesh.with_points(points), motion, before, state)
             return found.points, found.evaluation, count + 1
 
         return jax.lax.while_loop(unfinished, step, (mesh.points, before, jnp.int32(0)))[0]
 
-    def _sizes(self, mesh: Mesh, scale: Float[Array, ""]) -> tuple[Float[Array, " _"], ...]:
-        """Of a mesh that has been scaled; given sizes are not."""
-        own = target_measures(mesh)
-        if self.target != "given size":
-            return own
-        given = self.size if isinstance(self.size, tuple) else (self.size,) * len(own)
-        unit = scale**mesh.dim
-        return tuple(
-            jnp.full_like(part, 1) * jnp.asarray(size, part.dtype) * unit
-            for size, part in zip(given, own, strict=True)
-        )
-
     def _problem(self, mesh: Mesh, motion: Motion, sizes, aggregation: Aggregation) -> Problem:
-        weight = 0.0 if self.target == "free size" else self.size_weight
+        weight = self.target.weight if self.target.sized else 0.0
         return problem(mesh, motion, sizes, aggregation, self.metric, weight)
 
     def _pivot(self, task: Problem, points: Float[Array, "nodes dim"]) -> Float[Array, ""]:
