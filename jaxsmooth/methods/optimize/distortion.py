@@ -37,7 +37,7 @@ _SKEW = 0.5  # weight of the corner term beside the isoperimetric one
 _ROUND = 0.02  # radius of the rounded kink of `_excess`
 
 Nodes = Float[Array, "k dim"]
-Scalar = Float[Array, ""]
+Scalar = Float[Array, ""] | float
 
 
 def positive_part(det: Array, eps: Array | float) -> Array:
@@ -52,7 +52,7 @@ def positive_part(det: Array, eps: Array | float) -> Array:
     return jnp.where(behind, without_cancellation, (det + root) / 2)
 
 
-def regularisation(worst: Scalar) -> Scalar:
+def regularisation(worst: Float[Array, "..."]) -> Float[Array, "..."]:
     """ε for a mesh whose least relative determinant is `worst`: none for a valid one.
 
     Proportional to the worst inversion, so that it falls as the mesh untangles (Garanzha et al.

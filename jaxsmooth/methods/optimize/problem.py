@@ -38,7 +38,7 @@ __all__ = ["Aggregation", "Problem", "problem"]
 _HEAVY = 4  # memory of an element's energy, in units of a product with linear tetrahedra
 
 Field = Float[Array, "nodes dim"]
-Scalar = Float[Array, ""]
+Scalar = Float[Array, ""] | float
 
 
 # --- Aggregation ---------------------------------------------------------------------------------
