@@ -80,9 +80,7 @@ def extend_exodus() -> None:
 def _bend(points: np.ndarray, nodes: np.ndarray, name: str) -> float:
     """Mean distance of nodes from where straight elements have them."""
     kind = element_type(name)
-    linear = element_type(kind.name.rstrip("0123456789"))
-    shape = linear.shape_functions(kind.natural)
-    straight = np.einsum("ac,ecd->ead", shape, points[nodes[:, : linear.k]])
+    straight = np.einsum("ac,ecd->ead", kind.straight, points[nodes[:, : kind.corners]])
     return float(np.linalg.norm(points[nodes] - straight, axis=-1).mean())
 
 
