@@ -31,7 +31,7 @@ class Material(eqx.Module):
     poisson: Float[Array, ""] | float = 0.0
 
     @property
-    def lame(self) -> tuple[Array, Array]:
+    def lame(self) -> tuple[Array | float, Array | float]:
         """Lamé's constants (λ, μ)."""
         e, nu = self.young, self.poisson
         return e * nu / ((1 + nu) * (1 - 2 * nu)), e / (2 * (1 + nu))
