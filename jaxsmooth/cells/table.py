@@ -58,7 +58,7 @@ class FacetGroup:
     nodes: Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ElementType:
     """One row of the table.  All arrays are NumPy float64 or int; `k` counts the nodes.
 
@@ -75,6 +75,9 @@ class ElementType:
     node_rule: NodeRule
     span: Span
     rule: Rule
+
+    def __repr__(self) -> str:
+        return f"ElementType({self.name!r})"
 
     @property
     def dim(self) -> int:
@@ -308,15 +311,10 @@ TYPES: dict[str, ElementType] = {}
 
 
 def add_element_type(row: ElementType) -> ElementType:
-    """Add a row to the table: the type is known by its name everywhere then.
-
-    The types of its edges and facets have to be there.
+    """Add a row to the table, and return it: the type is known by its name everywhere then.
 
     Args:
-        row: the type, with a name of its own.
-
-    Returns:
-        The row.
+        row: the type, with a name of its own; the types of its edges and facets have to be there.
 
     Raises:
         ValueError: the name is taken, the span doesn't fit the nodes or lacks linear functions, the
