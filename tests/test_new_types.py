@@ -1,18 +1,22 @@
 """Element types that a user adds to the table from outside, and what the table refuses."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
 import meshes
+import meshio
 import numpy as np
 import pytest
+from meshio._mesh import topological_dimension
 
 import jaxsmooth as js
 from jaxsmooth.cells import families, quadrature
 from jaxsmooth.cells.families import NodeRule
 from jaxsmooth.cells.spans import Span
 from jaxsmooth.cells.table import TYPES, ElementType, add_element_type, element_type, supported
+from jaxsmooth.convert.checks import MeshFileError
 from jaxsmooth.metrics.table import min_jacobian
 from jaxsmooth.metrics.validity import determinant_bound, inverted
 
@@ -20,10 +24,11 @@ from jaxsmooth.metrics.validity import determinant_bound, inverted
 @pytest.fixture
 def table():
     """Whatever a test adds is gone after it."""
-    before = dict(TYPES)
+    before = [(known, set(known)) for known in (TYPES, topological_dimension)]
     yield TYPES
-    for name in set(TYPES) - set(before):
-        del TYPES[name]
+    for known, names in before:
+        for name in set(known) - names:
+            del known[name]
 
 
 def add_triangle7():
@@ -83,6 +88,20 @@ def test_the_new_type_is_one_like_the_others(table):
     assert float(min_jacobian(row, jnp.asarray(fold))) < 0
     bound = jax.jit(lambda x: determinant_bound(row, x))
     assert float(bound(jnp.asarray(fold))) < 0 < float(bound(jnp.asarray(row.ideal)))
+
+
+def test_a_name_that_meshio_lacks(table, tmp_path):
+    """Such cells are checked like others, written where a format takes any name, refused elsewhere."""
+    add_element_type(replace(add_triangle7(), name="bubble"))
+    points, blocks = centred(0.2)[1]
+    mesh = js.as_mesh((points, {"bubble": blocks["triangle7"][:, [0, 2, 1, 5, 4, 3, 6]]}))
+    np.testing.assert_array_equal(mesh.connectivity[0], blocks["triangle7"])  # turned
+    file = js.from_meshio(meshio.Mesh(points, {"bubble": blocks["triangle7"]}))
+    js.write(tmp_path / "a.npz", file)
+    np.testing.assert_array_equal(js.read(tmp_path / "a.npz").mesh.connectivity[0], blocks["triangle7"])
+    for suffix in ("vtu", "msh", "xdmf", "inp"):
+        with pytest.raises(MeshFileError, match=r"files can't hold bubble elements; write \.npz instead"):
+            js.write(tmp_path / f"a.{suffix}", file)
 
 
 CUBIC = "00 10 01 20 11 02 30 21 12 03"
