@@ -11,8 +11,10 @@ KINDS_3D = (
     "tetra10",
     "pyramid",
     "pyramid13",
+    "pyramid14",
     "wedge",
     "wedge15",
+    "wedge18",
     "hexahedron",
     "hexahedron20",
     "hexahedron27",
@@ -28,8 +30,10 @@ LINEAR = {
     "tetra10": "tetra",
     "pyramid": "pyramid",
     "pyramid13": "pyramid",
+    "pyramid14": "pyramid",
     "wedge": "wedge",
     "wedge15": "wedge",
+    "wedge18": "wedge",
     "hexahedron": "hexahedron",
     "hexahedron20": "hexahedron",
     "hexahedron27": "hexahedron",
@@ -82,8 +86,8 @@ def groups(kind):
     found = [(c,) for c in range(CORNERS[base])]
     if kind != base:
         found += EDGES[base]
-    if kind == "hexahedron27":
-        found += FACES[base]
+    if kind in ("pyramid14", "wedge18", "hexahedron27"):
+        found += [face for face in FACES[base] if len(face) == 4]
     if kind in ("quad9", "hexahedron27"):
         found.append(tuple(range(CORNERS[base])))
     return found

@@ -77,7 +77,9 @@ def layered(kind, growth=1.8, first=1e-3, turn=True, layers=8):
     return mesh, points, heights
 
 
-@pytest.mark.parametrize("kind", ["quad", "quad8", "quad9", "hexahedron", "hexahedron20", "wedge", "wedge15"])
+@pytest.mark.parametrize(
+    "kind", ["quad", "quad8", "quad9", "hexahedron", "hexahedron20", "wedge", "wedge15", "wedge18"]
+)
 def test_layers_on_a_wall(kind):
     mesh, points, heights = layered(kind)
     nodes = np.asarray(mesh.connectivity[0])

@@ -51,7 +51,8 @@ def test_cohesive_cells_are_written_as_they_were():
 
 
 @pytest.mark.parametrize(
-    "name", ["quad", "quad8", "quad9", "wedge", "wedge15", "hexahedron", "hexahedron20", "hexahedron27"]
+    "name",
+    ["quad", "quad8", "quad9", "wedge", "wedge15", "wedge18", "hexahedron", "hexahedron20", "hexahedron27"],
 )
 def test_elements_without_thickness_in_every_direction(name):
     """Two blocks of elements, and between them copies of the common nodes with an element of no height."""

@@ -1,12 +1,16 @@
 """The table of reference elements against closed forms and node orders typed in by hand."""
 
+import ast
+import sys
 from itertools import product
 from math import factorial, gamma
+from pathlib import Path
 
 import meshes
 import numpy as np
 import pytest
 
+from jaxsmooth import cells
 from jaxsmooth.cells.table import TYPES, element_type, supported
 
 KINDS = meshes.KINDS
@@ -76,7 +80,7 @@ def test_ideal_element_has_unit_measure_and_the_node_order_of_vtk(kind):
     }[meshes.LINEAR[kind]]
     row = element_type(kind)
     np.testing.assert_allclose(row.ideal, meshes.ideal(kind, length), rtol=0, atol=1e-14)
-    assert row.order == (1 if kind == meshes.LINEAR[kind] else 2)
+    assert row.linear == (kind == meshes.LINEAR[kind])
     assert row.dim == meshes.dim_of(kind)
     assert row.corners == meshes.CORNERS[meshes.LINEAR[kind]]
     assert row.k == len(meshes.groups(kind))
@@ -90,8 +94,9 @@ def test_edges_are_equal_and_in_order(kind):
     np.testing.assert_allclose(lengths, lengths[0], rtol=1e-14)
     # segments are the edges, or their halves through the mid-side nodes
     halves = np.linalg.norm(np.diff(row.ideal[row.segments], axis=1)[:, 0], axis=1)
-    np.testing.assert_allclose(halves, lengths[0] / row.order, rtol=1e-14)
-    assert len({frozenset(s) for s in row.segments.tolist()}) == row.order * len(row.edges)
+    order = 1 if kind == meshes.LINEAR[kind] else 2
+    np.testing.assert_allclose(halves, lengths[0] / order, rtol=1e-14)
+    assert len({frozenset(s) for s in row.segments.tolist()}) == order * len(row.edges)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -131,10 +136,11 @@ def exact_exponents(kind):
     """Monomials that the rule of a type has to integrate exactly."""
     dim = meshes.dim_of(kind)
     total = {"triangle": 1, "triangle6": 4, "tetra": 1, "tetra10": 5, "pyramid": 1, "pyramid13": 5}
+    total["pyramid14"] = 5
     everything = product(range(6), repeat=dim)
     if kind in total:
         return [e for e in everything if sum(e) <= total[kind]]
-    if kind in ("wedge", "wedge15"):
+    if meshes.LINEAR[kind] == "wedge":
         plane, along = (2, 3) if kind == "wedge" else (4, 5)
         return [e for e in everything if sum(e[:2]) <= plane and e[2] <= along]
     each = 3 if kind in ("quad", "hexahedron") else 5
@@ -164,7 +170,7 @@ def test_gradients_agree_with_differences(kind):
     )
 
 
-@pytest.mark.parametrize("kind", ["pyramid", "pyramid13"])
+@pytest.mark.parametrize("kind", ["pyramid", "pyramid13", "pyramid14"])
 @pytest.mark.parametrize("distance", [1e-2, 1e-4])
 def test_pyramid_gradients_near_the_apex(kind, distance):
     # on lines to the apex: one edge, one within the pyramid, the axis
@@ -207,7 +213,10 @@ def test_node_positions_of_vtk():
     wedge = element_type("wedge15").natural
     np.testing.assert_array_equal(wedge[[6, 9, 10]], [(0.5, 0, -1), (0.5, 0, 1), (0.5, 0.5, 1)])
     np.testing.assert_array_equal(wedge[[12, 13, 14]], [(0, 0, 0), (1, 0, 0), (0, 1, 0)])
+    centres = [(0.5, 0, 0), (0.5, 0.5, 0), (0, 0.5, 0)]  # of VTK_BIQUADRATIC_QUADRATIC_WEDGE
+    np.testing.assert_array_equal(element_type("wedge18").natural, [*wedge, *centres])
     pyramid = element_type("pyramid13").natural
+    np.testing.assert_array_equal(element_type("pyramid14").natural, [*pyramid, (0, 0, 0)])
     np.testing.assert_array_equal(pyramid[[5, 7, 8]], [(0, -1, 0), (0, 1, 0), (-1, 0, 0)])
     np.testing.assert_array_equal(pyramid[[9, 11]], [(-0.5, -0.5, 0.5), (0.5, 0.5, 0.5)])
     np.testing.assert_array_equal(element_type("quad9").natural[[4, 7, 8]], [(0, -1), (-1, 0), (0, 0)])
@@ -263,6 +272,62 @@ def test_facets_have_all_their_nodes(kind):
             else:
                 expected = np.array([nodes[0], nodes[1], (nodes[0] + nodes[1]) / 2])[: len(nodes)]
             np.testing.assert_allclose(nodes, expected, atol=1e-15)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_traces_are_the_functions_of_the_facets(kind):
+    """On a facet an element has its facet type's shape functions, so that neighbours conform."""
+    row = element_type(kind)
+    for group in row.facets:
+        inner = np.random.default_rng(6).dirichlet(np.ones(group.type.corners), 5)
+        places = inner @ group.type.natural[: group.type.corners]
+        expected = group.type.shape_functions(places)
+        for facet in group.nodes:
+            # the straight facet: the facet's linear functions carry its places to the element
+            linear = element_type({2: "line", 3: "triangle", 4: "quad"}[group.type.corners]).shape_functions(
+                places
+            )
+            values = row.shape_functions(linear @ row.natural[facet[: group.type.corners]])
+            np.testing.assert_allclose(values[:, facet], expected, atol=1e-13)
+            np.testing.assert_allclose(np.delete(values, facet, axis=1), 0, atol=1e-13)
+
+
+FACETS = {
+    "quad9": {"line3": 4},
+    "tetra10": {"triangle6": 4},
+    "pyramid": {"quad": 1, "triangle": 4},
+    "pyramid13": {"quad8": 1, "triangle6": 4},
+    "pyramid14": {"quad9": 1, "triangle6": 4},
+    "wedge": {"triangle": 2, "quad": 3},
+    "wedge15": {"triangle6": 2, "quad8": 3},
+    "wedge18": {"triangle6": 2, "quad9": 3},
+    "hexahedron20": {"quad8": 6},
+    "hexahedron27": {"quad9": 6},
+}
+
+
+@pytest.mark.parametrize("kind", FACETS)
+def test_types_of_facets(kind):
+    assert {g.type.name: len(g.nodes) for g in element_type(kind).facets} == FACETS[kind]
+
+
+def test_properties_that_the_package_asks_for():
+    linear = {kind for kind in KINDS if element_type(kind).linear}
+    assert linear == set(meshes.CORNERS)
+    assert {k for k in KINDS if element_type(k).constant_jacobian} == {"triangle", "tetra"}
+    optimal = {k for k in KINDS if element_type(k).ideal_is_optimum}
+    assert optimal == {"triangle", "quad", "tetra", "hexahedron"}
+    axes = {"quad": (0, 1), "wedge": (2,), "hexahedron": (0, 1, 2)}
+    for kind in KINDS:
+        row, base = element_type(kind), meshes.LINEAR[kind]
+        assert row.singular_corners == ((4,) if base == "pyramid" else ())
+        assert row.extruded_axes == axes.get(base, ())
+        np.testing.assert_allclose(row.straight @ row.natural[: row.corners], row.natural, atol=1e-15)
+        if row.dim == 2:
+            ring = [row.natural[: row.corners][list(e)] for e in meshes.EDGES[base]]
+            count = 1 if row.linear else 2
+            expected = [a + (b - a) * part / count for a, b in ring for part in range(count)]
+            np.testing.assert_allclose(row.natural[row.outline], expected, atol=1e-15)
 
 
 def signed_measure(kind, nodes):
@@ -365,7 +430,7 @@ def test_corner_frames_are_edge_tangents(kind):
             if corner in edge:
                 other = nodes[sum(edge) - corner]
                 tangent = other - nodes[corner]
-                if row.order == 2:  # of the parabola through both ends and the middle
+                if not row.linear:  # of the parabola through both ends and the middle
                     tangent = 4 * nodes[middle[frozenset(edge)]] - 3 * nodes[corner] - other
                 expected.append(tangent / np.linalg.norm(tangent))
         found = (frame / np.linalg.norm(frame, axis=0)).T
@@ -374,3 +439,16 @@ def test_corner_frames_are_edge_tangents(kind):
 
 def test_table_is_cached_by_name():
     assert element_type("tetra") is TYPES["tetra"]
+
+
+def test_the_table_needs_numpy_alone():
+    folder = Path(cells.__file__).parent
+    found = set()
+    for path in folder.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                found |= {name.name for name in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                found.add(node.module)
+    packages = {name.split(".")[0] for name in found if not name.startswith("jaxsmooth.cells")}
+    assert packages <= {"numpy", *sys.stdlib_module_names}

@@ -149,7 +149,9 @@ def test_curved_side_is_integrated(kind, bulge):
     assert evaluate(kind, nodes)["measure"][0] == pytest.approx(area, rel=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["tetra10", "wedge15", "pyramid13", "hexahedron20", "hexahedron27"])
+@pytest.mark.parametrize(
+    "kind", ["tetra10", "wedge15", "wedge18", "pyramid13", "pyramid14", "hexahedron20", "hexahedron27"]
+)
 def test_curved_faces_are_integrated(kind):
     """Faces bent by a quadratic map: the area of their image by a fine rule in ideal coordinates."""
     base = meshes.LINEAR[kind]

@@ -90,6 +90,35 @@ def random_elements(kind, seed=0):
     return start + amplitude * rng.uniform(-1, 1, (COUNT, *start.shape))
 
 
+# By hand: dimension and degree of the determinant in every factor of the domain.
+DEGREES = {
+    "triangle": [(2, 0)],
+    "triangle6": [(2, 2)],
+    "quad": [(1, 1), (1, 1)],
+    "quad8": [(1, 3), (1, 3)],
+    "quad9": [(1, 3), (1, 3)],
+    "tetra": [(3, 0)],
+    "tetra10": [(3, 3)],
+    "pyramid": [(1, 1), (1, 1), (1, 0)],
+    "pyramid13": [(1, 4), (1, 4), (1, 3)],
+    "pyramid14": [(1, 4), (1, 4), (1, 3)],
+    "wedge": [(2, 1), (1, 2)],
+    "wedge15": [(2, 4), (1, 5)],
+    "wedge18": [(2, 4), (1, 5)],
+    "hexahedron": [(1, 2), (1, 2), (1, 2)],
+    "hexahedron20": [(1, 5), (1, 5), (1, 5)],
+    "hexahedron27": [(1, 5), (1, 5), (1, 5)],
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_degrees_by_hand(kind):
+    table = bernstein(element_type(kind))
+    assert [(factor.dim, factor.degree) for factor in table.factors] == DEGREES[kind]
+    refined = kind in ("triangle6", "quad8", "quad9", "tetra10")  # bounds on halved elements, where cheap
+    assert (len(table.bounding) > len(table.matrix)) == refined
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_bernstein_form_reproduces_the_determinant(kind):
     """The degrees suffice: the polynomial from the samples agrees with the determinant everywhere."""

@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 
 from benchmarks.paper.examples import Outcome, quality_values
 from jaxsmooth.assembly import gather, scatter_add
-from jaxsmooth.cells.table import ElementType
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.methods.elastic.elasticity import Material, element_force, linearise
 from jaxsmooth.methods.elastic.fitting import target_element
@@ -80,15 +79,8 @@ def _forces(mesh: Mesh, projectors: jax.Array) -> jax.Array:
 def _plane(mesh: Mesh, q: np.ndarray) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
     polygons: list[np.ndarray] = []
     for kind, nodes in mesh.blocks:
-        polygons += list(np.asarray(mesh.points)[np.asarray(nodes)[:, _ring(kind)]])
+        polygons += list(np.asarray(mesh.points)[np.asarray(nodes)[:, kind.outline]])
     return polygons, q, np.ones(len(q))
-
-
-def _ring(kind: ElementType) -> list[int]:
-    """Nodes around a plane element, mid-side nodes between the corners."""
-    if kind.order == 1:
-        return list(range(kind.corners))
-    return [node for i in range(kind.corners) for node in (i, kind.corners + i)]
 
 
 def _solid(mesh: Mesh, q: np.ndarray, view: View) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:

@@ -19,28 +19,11 @@ import numpy as np
 
 from jaxsmooth.cells.table import ElementType
 
-__all__ = ["DEGREES", "Bernstein", "bernstein"]
+__all__ = ["Bernstein", "bernstein", "determinant_degrees"]
 
 Array = np.ndarray
 
-# Dimension and degree of the determinant in every factor of the domain.
-DEGREES: dict[str, tuple[tuple[int, int], ...]] = {
-    "triangle": ((2, 0),),
-    "triangle6": ((2, 2),),
-    "quad": ((1, 1), (1, 1)),
-    "quad8": ((1, 3), (1, 3)),
-    "quad9": ((1, 3), (1, 3)),
-    "tetra": ((3, 0),),
-    "tetra10": ((3, 3),),
-    "pyramid": ((1, 1), (1, 1), (1, 0)),
-    "pyramid13": ((1, 4), (1, 4), (1, 3)),
-    "wedge": ((2, 1), (1, 2)),
-    "wedge15": ((2, 4), (1, 5)),
-    "hexahedron": ((1, 2), (1, 2), (1, 2)),
-    "hexahedron20": ((1, 5), (1, 5), (1, 5)),
-    "hexahedron27": ((1, 5), (1, 5), (1, 5)),
-}
-_REFINED = ("triangle6", "quad8", "quad9", "tetra10")  # whose bounds are taken on halved elements
+_HALVED = 64  # coefficients; types with mid-side nodes and no more have bounds on halved elements
 _SAME = 1e-12  # difference of gradients, which are of order 1, that is rounding
 
 
@@ -111,6 +94,34 @@ _PARTS = {
 }
 
 
+def determinant_degrees(kind: ElementType) -> tuple[int, ...]:
+    """Degree of the determinant in every factor of the domain of a type, from the span.
+
+    The determinant is a sum of products of one derivative along each axis, so its degree is at most
+    the sum of theirs.  In the collapsed coordinates a, b and w = 1 − z of a pyramid xⁱ yʲ (1 − z)ᵖ⁻ⁱ⁻ʲ is
+    aⁱ bʲ wᵖ, and the determinant that of the columns ∂/∂a / w, ∂/∂b / w and ∂/∂w.  A multiple of the first
+    added to the third takes the terms with p = i out of it, which would count too much along a; the
+    second does the same along b.
+    """
+    span, powers = kind.span, kind.span.powers
+    if not kind.singular_corners:
+        ends = np.cumsum(kind.family.factors)[:-1]
+        return tuple(
+            sum(
+                int((powers[:, part].sum(axis=1) - (d in part))[powers[:, d] > 0].max())
+                for d in range(kind.dim)
+            )
+            for part in np.split(np.arange(kind.dim), ends)
+        )
+    lowest = powers[:, 0] + powers[:, 1] - span.poles  # zᵏ = (1 − w)ᵏ has powers of w up to k
+    terms = {(i, j, p + n) for (i, j, k), p in zip(powers, lowest, strict=True) for n in range(k + 1)}
+    i, j, p = np.array(sorted(terms)).T
+    along_a = (i - 1)[i > 0].max() + i[j > 0].max() + i[p != i].max()
+    along_b = (j - 1)[j > 0].max() + j[i > 0].max() + j[p != j].max()
+    along_w = sum((p - 1)[chosen > 0].max() for chosen in (i, j, p))
+    return int(along_a), int(along_b), int(along_w)
+
+
 def _kron(matrices: Sequence[Array]) -> Array:
     return reduce(np.kron, matrices)
 
@@ -129,7 +140,8 @@ class Bernstein:
     @cached_property
     def factors(self) -> tuple[_Simplex, ...]:
         """The simplices whose product is the domain."""
-        return tuple(_Simplex(dim, degree) for dim, degree in DEGREES[self.kind.name])
+        degrees = determinant_degrees(self.kind)
+        return tuple(_Simplex(*pair) for pair in zip(self.kind.family.factors, degrees, strict=True))
 
     @cached_property
     def _sampling(self) -> tuple[Array, ...]:
@@ -144,7 +156,7 @@ class Bernstein:
 
     @property
     def _collapsed(self) -> bool:
-        return self.kind.name.startswith("pyramid")
+        return bool(self.kind.singular_corners)
 
     def natural(self, points: Array) -> Array:
         """Natural coordinates of points of the domain, both ``[points, dim]``."""
@@ -225,7 +237,7 @@ class Bernstein:
         """Coefficients whose least bounds the determinant, from samples ``[b, s]``.
 
         Those of the halved element where that is cheap, each once: neighbours share some."""
-        if self.kind.name not in _REFINED:
+        if self.kind.linear or len(self.points) > _HALVED:
             return self.matrix
         rows = np.unique(np.concatenate(self.halves), axis=0)
         return rows @ self.matrix

@@ -6,179 +6,48 @@ unit measure, so that ``A = Xᵀ G`` is the deformation gradient from the ideal 
 element with nodes ``X``, ``det A`` is 1 on the ideal element, and quadrature weights sum
 to 1.  Node order is meshio's (VTK's, and Gmsh's prism for the linear wedge).
 
-Adding a type is adding a row: its nodes in natural coordinates, the functions that span
-its shape functions, its facets and a quadrature rule.  Everything else is derived here.
+Adding a type is adding a row: its family, which entities carry nodes, the functions that span
+its shape functions, and a quadrature rule.  Everything else is derived here.  `add_element_type`
+adds one from outside.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 
-from jaxsmooth.cells.quadrature import RULES
+from jaxsmooth.cells.families import (
+    HEXAHEDRON,
+    LINE,
+    PYRAMID,
+    QUADRILATERAL,
+    TETRAHEDRON,
+    TRIANGLE,
+    WEDGE,
+    Family,
+    NodeRule,
+)
+from jaxsmooth.cells.quadrature import (
+    PYRAMID_4,
+    PYRAMID_27,
+    TETRAHEDRON_14,
+    TRIANGLE_3,
+    TRIANGLE_6,
+    Rule,
+    gauss,
+    product,
+    simplex_centre,
+)
+from jaxsmooth.cells.spans import APEX, Span, tensor
 
-__all__ = ["TYPES", "ElementType", "FacetGroup", "element_type", "supported"]
+__all__ = ["TYPES", "ElementType", "FacetGroup", "add_element_type", "element_type", "supported"]
 
 Array = np.ndarray
 
-
-# --- Spans of the shape functions ------------------------------------------------------
-# A span returns values [points, k] and derivatives [points, k, dim] at natural points.
-
-
-def _monomials(exponents: str) -> Callable[[Array], tuple[Array, Array]]:
-    """The span of monomials, written as exponent digits: ``"00 10 01"`` is 1, x, y."""
-    powers = np.array([[int(digit) for digit in term] for term in exponents.split()])
-
-    def span(points: Array) -> tuple[Array, Array]:
-        values = np.prod(points[:, None, :] ** powers, axis=-1)
-        slopes = np.empty((*values.shape, powers.shape[1]))
-        for axis in range(powers.shape[1]):
-            lowered = powers.copy()
-            lowered[:, axis] = np.maximum(lowered[:, axis] - 1, 0)
-            slopes[..., axis] = powers[:, axis] * np.prod(points[:, None, :] ** lowered, axis=-1)
-        return values, slopes
-
-    return span
-
-
-def _pyramid(rational: tuple[tuple[int, int, int], ...], polynomial: str):
-    """Monomials, and the rational terms xⁱ yʲ zᵏ / (1 − z) that pyramids need (Bedrosian 1992)."""
-    monomials = _monomials(polynomial)
-
-    def span(points: Array) -> tuple[Array, Array]:
-        values, slopes = monomials(points)
-        x, y, z = points.T
-        w = np.maximum(1.0 - z, _APEX)  # at the apex x = y = 0 and every term vanishes
-        more, more_slopes = [], []
-        for i, j, k in rational:
-            top, zk = x**i * y**j, z**k
-            more.append(top * zk / w)
-            dx = i * x ** max(i - 1, 0) * y**j * zk / w
-            dy = j * x**i * y ** max(j - 1, 0) * zk / w
-            dz = top * (k * z ** max(k - 1, 0) / w + zk / w**2)
-            more_slopes.append(np.stack([dx, dy, dz], axis=-1))
-        return (
-            np.concatenate([values, np.stack(more, axis=1)], axis=1),
-            np.concatenate([slopes, np.stack(more_slopes, axis=1)], axis=1),
-        )
-
-    return span
-
-
-def _tensor(first: str, second: str) -> str:
-    return " ".join(a + b for a in first.split() for b in second.split())
-
-
-_APEX = 2.0**-40  # distance from an apex at which its Jacobian is taken, along the lateral edges
-_P1, _P2 = "00 10 01", "00 10 01 20 11 02"
-_Q1, _Q2 = _tensor("0 1", "0 1"), _tensor("0 1 2", "0 1 2")
-_S2 = _Q1 + " 20 02 21 12"  # serendipity quadrilateral
-_SPANS: dict[str, Callable[[Array], tuple[Array, Array]]] = {
-    "line": _monomials("0 1"),
-    "line3": _monomials("0 1 2"),
-    "triangle": _monomials(_P1),
-    "triangle6": _monomials(_P2),
-    "quad": _monomials(_Q1),
-    "quad8": _monomials(_S2),
-    "quad9": _monomials(_Q2),
-    "tetra": _monomials("000 100 010 001"),
-    "tetra10": _monomials("000 100 010 001 200 020 002 110 011 101"),
-    "pyramid": _pyramid(((1, 1, 0),), "000 100 010 001"),
-    "pyramid13": _pyramid(
-        ((1, 1, 0), (1, 1, 1), (2, 1, 0), (1, 2, 0)),
-        "000 100 010 001 200 020 002 101 011",
-    ),
-    "wedge": _monomials(_tensor(_P1, "0 1")),
-    "wedge15": _monomials(_tensor(_P2, "0 1") + " " + _tensor(_P1, "2")),
-    "hexahedron": _monomials(_tensor(_Q1, "0 1")),
-    "hexahedron20": _monomials(_tensor(_Q1, "0 1") + " 200 210 201 211 020 120 021 121 002 102 012 112"),
-    "hexahedron27": _monomials(_tensor(_Q2, "0 1 2")),
-}
-
-
-# --- Nodes, edges, facets, ideal coordinates -------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Shape:
-    """A family of element types: what its linear and quadratic members share."""
-
-    dim: int
-    corners: Array  # natural coordinates [corners, dim]
-    ideal: Array  # Eqs. 16–20, [corners, dim]
-    edges: tuple[tuple[int, int], ...]  # in the order of the mid-side nodes
-    facets: tuple[tuple[int, ...], ...]  # corner nodes, outward
-
-
-_L3, _L4 = 2 / 3**0.25, (6 * 2**0.5) ** (1 / 3)
-_L5, _L6 = (3 * 2**0.5) ** (1 / 3), (4 / 3**0.5) ** (1 / 3)
-_TRI = np.array([[0, 0], [1, 0], [1 / 2, 3**0.5 / 2]])
-_SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
-
-
-def _stack(base: Array, low: float, high: float) -> Array:
-    return np.concatenate([np.c_[base, np.full(len(base), z)] for z in (low, high)])
-
-
-_RING3, _RING4 = ((0, 1), (1, 2), (2, 0)), ((0, 1), (1, 2), (2, 3), (3, 0))
-_SHAPES = {
-    "line": _Shape(1, np.array([[-1.0], [1.0]]), np.array([[0.0], [1.0]]), ((0, 1),), ()),
-    "triangle": _Shape(2, np.array([[0, 0], [1, 0], [0, 1]], float), _L3 * _TRI, _RING3, _RING3),
-    "quad": _Shape(2, 2 * _SQUARE - 1, _SQUARE, _RING4, _RING4),
-    "tetra": _Shape(
-        3,
-        np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float),
-        _L4 * np.r_[np.c_[_TRI, np.zeros(3)], [[1 / 2, 3**0.5 / 6, 6**0.5 / 3]]],
-        (*_RING3, (0, 3), (1, 3), (2, 3)),
-        ((0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3)),
-    ),
-    "pyramid": _Shape(
-        3,
-        np.r_[np.c_[2 * _SQUARE - 1, np.zeros(4)], [[0, 0, 1]]],
-        _L5 * np.r_[np.c_[_SQUARE, np.zeros(4)], [[1 / 2, 1 / 2, 2**0.5 / 2]]],
-        (*_RING4, (0, 4), (1, 4), (2, 4), (3, 4)),
-        ((0, 3, 2, 1), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)),
-    ),
-    "wedge": _Shape(
-        3,
-        _stack(np.array([[0, 0], [1, 0], [0, 1]], float), -1, 1),
-        _L6 * _stack(_TRI, 0, 1),
-        (*_RING3, (3, 4), (4, 5), (5, 3), (0, 3), (1, 4), (2, 5)),
-        ((0, 2, 1), (3, 4, 5), (0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)),
-    ),
-    "hexahedron": _Shape(
-        3,
-        _stack(2 * _SQUARE - 1, -1, 1),
-        _stack(_SQUARE, 0, 1),
-        (*_RING4, (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)),
-        ((0, 4, 7, 3), (1, 2, 6, 5), (0, 1, 5, 4), (2, 3, 7, 6), (0, 3, 2, 1), (4, 5, 6, 7)),
-    ),
-}
-
-# name: (shape, order, facets and the volume carry centre nodes)
-_ROWS = {
-    "line": ("line", 1, False),
-    "line3": ("line", 2, False),
-    "triangle": ("triangle", 1, False),
-    "triangle6": ("triangle", 2, False),
-    "quad": ("quad", 1, False),
-    "quad8": ("quad", 2, False),
-    "quad9": ("quad", 2, True),
-    "tetra": ("tetra", 1, False),
-    "tetra10": ("tetra", 2, False),
-    "pyramid": ("pyramid", 1, False),
-    "pyramid13": ("pyramid", 2, False),
-    "wedge": ("wedge", 1, False),
-    "wedge15": ("wedge", 2, False),
-    "hexahedron": ("hexahedron", 1, False),
-    "hexahedron20": ("hexahedron", 2, False),
-    "hexahedron27": ("hexahedron", 2, True),
-}
-_FACET_NAMES = {(2, 1): "line", (2, 2): "line3", (3, 1): "triangle", (3, 2): "triangle6"}
+_SAME = 1e-9  # a difference of natural coordinates, or of what is of size 1, that is rounding
+_SINGULAR = 1e8  # condition of the values at the nodes that stands for a singular matrix; it is below 1e3
 
 
 @dataclass(frozen=True)
@@ -189,78 +58,138 @@ class FacetGroup:
     nodes: Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ElementType:
-    """One row of the table.  All arrays are NumPy float64 or int; `k` counts the nodes."""
+    """One row of the table.  All arrays are NumPy float64 or int; `k` counts the nodes.
+
+    Attributes:
+        name: how the type is called: meshio's name, where it has one.
+        family: its shape.
+        node_rule: which entities carry nodes beside the corners.
+        span: that of the shape functions; it has to hold all linear functions.
+        rule: quadrature points ``[q, dim]`` and weights ``[q]`` on the natural domain.
+    """
 
     name: str
-    order: int
-    centred: bool
-    shape: _Shape
+    family: Family
+    node_rule: NodeRule
+    span: Span
+    rule: Rule
+
+    def __repr__(self) -> str:
+        return f"ElementType({self.name!r})"
 
     @property
     def dim(self) -> int:
         """Dimension of the element: 1, 2 or 3."""
-        return self.shape.dim
+        return self.family.dim
 
     @property
     def corners(self) -> int:
         """Number of corner nodes; they come first in the node order."""
-        return len(self.shape.corners)
+        return len(self.family.corners)
 
     @property
     def k(self) -> int:
         """Number of nodes."""
         return len(self.natural)
 
+    @property
+    def linear(self) -> bool:
+        """Whether the corners are all its nodes: its edges are straight."""
+        return self.node_rule == NodeRule()
+
+    @property
+    def constant_jacobian(self) -> bool:
+        """Whether one Jacobian determinant holds for the whole element: straight simplices."""
+        return self.linear and len(self.family.factors) == 1
+
+    @property
+    def ideal_is_optimum(self) -> bool:
+        """Whether the paper's q is largest on the ideal element.
+
+        Not on wedges and pyramids, nor with mid-side nodes, which raise it by bulging."""
+        return self.linear and self.family.ideal_is_optimum
+
+    @property
+    def singular_corners(self) -> tuple[int, ...]:
+        """Corners without a Jacobian, where more than `dim` edges meet: the apex of a pyramid."""
+        return self.family.singular_corners
+
+    @property
+    def extruded_axes(self) -> tuple[int, ...]:
+        """Natural axes along which the element is a facet times a line: its two ends face each other."""
+        if self.singular_corners or self.dim == 1:
+            return ()
+        starts = np.cumsum(self.family.factors) - self.family.factors
+        return tuple(int(a) for a, size in zip(starts, self.family.factors, strict=True) if size == 1)
+
     @cached_property
     def natural(self) -> Array:
         """Natural coordinates of the nodes ``[k, dim]``."""
-        corners = self.shape.corners
-        nodes = [corners]
-        if self.order == 2:
-            nodes.append(np.array([corners[list(edge)].mean(axis=0) for edge in self.shape.edges]))
-        if self.centred:
-            if self.dim == 3:
-                nodes.append(np.array([corners[list(f)].mean(axis=0) for f in self.shape.facets]))
-            nodes.append(corners.mean(axis=0, keepdims=True))
-        return np.concatenate(nodes)
+        return self.family.place(self.node_rule)
+
+    @cached_property
+    def straight(self) -> Array:
+        """Weights of the corners ``[k, corners]`` that give the nodes of an element with straight sides."""
+        return self.family.straight(self.natural)
 
     @cached_property
     def ideal(self) -> Array:
         """Nodes of the ideal element of unit measure ``[k, dim]`` (C_l; Eqs. 16–20)."""
-        linear = element_type(_ROWS[self.name][0])
-        return linear.shape_functions(self.natural) @ self.shape.ideal
+        return self.straight @ self.family.ideal
 
     @cached_property
     def edges(self) -> Array:
         """Corner nodes of the edges ``[edges, 2]``."""
-        return np.array(self.shape.edges)
+        return np.array(self.family.edges)
+
+    @cached_property
+    def edge_nodes(self) -> FacetGroup:
+        """The edges with all their nodes."""
+        found = [self._side(edge) for edge in self.family.edges]
+        return FacetGroup(found[0][0], np.array([nodes for _, nodes in found]))
 
     @cached_property
     def segments(self) -> Array:
         """Pairs of neighbouring nodes along the edges, through mid-side nodes ``[m, 2]``."""
-        if self.order == 1:
-            return self.edges
-        middle = self.corners + np.arange(len(self.edges))
-        return np.concatenate([np.c_[self.edges[:, 0], middle], np.c_[middle, self.edges[:, 1]]])
+        nodes = self.edge_nodes.nodes
+        chain = np.c_[nodes[:, :1], nodes[:, 2:], nodes[:, 1:2]]
+        return np.concatenate([chain[:, i : i + 2] for i in range(chain.shape[1] - 1)])
+
+    @cached_property
+    def outline(self) -> Array:
+        """Nodes around a plane element, those of each edge in turn ``[m]``."""
+        return np.delete(self.edge_nodes.nodes, 1, axis=1).ravel()
 
     @cached_property
     def facets(self) -> tuple[FacetGroup, ...]:
         """Facets (faces in 3D, edges in 2D) with all their nodes, grouped by type."""
-        by_name: dict[str, list[list[int]]] = {}
-        for corners in self.shape.facets:
-            nodes = [*corners]
-            if self.order == 2:
-                ring = [{a, b} for a, b in zip(corners, (*corners[1:], corners[0]), strict=True)]
-                ring = ring[:1] if len(corners) == 2 else ring
-                edges = [set(edge) for edge in self.shape.edges]
-                nodes += [self.corners + edges.index(side) for side in ring]
-            if self.centred and self.dim == 3:
-                nodes.append(self.corners + len(self.edges) + self.shape.facets.index(corners))
-            quad = {1: "quad", 2: "quad9" if self.centred else "quad8"}[self.order]
-            by_name.setdefault(_FACET_NAMES.get((len(corners), self.order), quad), []).append(nodes)
-        return tuple(FacetGroup(element_type(name), np.array(nodes)) for name, nodes in by_name.items())
+        groups: dict[ElementType, list[list[int]]] = {}
+        for corners in self.family.facets:
+            kind, nodes = self._side(corners)
+            groups.setdefault(kind, []).append(nodes)
+        return tuple(FacetGroup(kind, np.array(nodes)) for kind, nodes in groups.items())
+
+    def _side(self, corners: tuple[int, ...]) -> tuple[ElementType, list[int]]:
+        """The type and the nodes, in its order, of the edge or face with these corners.
+
+        It is the type whose nodes have the places of all nodes of this one that are there."""
+        places = self.family.corners[list(corners)]
+        along = places[1:] - places[0]
+        apart = self.natural - places[0]
+        apart = apart - apart @ np.linalg.pinv(along) @ along
+        there = np.flatnonzero(np.abs(apart).max(axis=1) < _SAME)
+        for kind in TYPES.values():
+            if (kind.dim, kind.corners, kind.k) != (min(len(corners) - 1, 2), len(corners), len(there)):
+                continue
+            distance = np.abs((kind.straight @ places)[:, None] - self.natural).max(axis=-1)
+            if (distance.min(axis=1) < _SAME).all():
+                return kind, distance.argmin(axis=1).tolist()
+        raise ValueError(
+            f"element type {self.name!r} has {len(there)} nodes on the side with the corners "
+            f"{list(corners)}, and the table has no type with nodes at these places; add that type first"
+        )
 
     @cached_property
     def mirror(self) -> Array:
@@ -270,29 +199,30 @@ class ElementType:
         distance = np.abs(swapped[:, None] - self.natural).sum(axis=-1)
         return distance.argmin(axis=1)
 
-    def _shape_functions(self, points: Array) -> tuple[Array, Array]:
-        span = _SPANS[self.name]
-        coefficients = np.linalg.inv(span(self.natural)[0])
-        values, slopes = span(points)
-        return values @ coefficients, np.einsum("qmd,mk->qkd", slopes, coefficients)
+    @cached_property
+    def _coefficients(self) -> Array:
+        return np.linalg.inv(self.span.at(self.natural)[0])
 
     def shape_functions(self, points: Array) -> Array:
         """Values of the shape functions ``[points, k]`` at natural coordinates."""
-        return self._shape_functions(np.asarray(points, float))[0]
+        return self.span.at(np.asarray(points, float))[0] @ self._coefficients
+
+    def slopes_at(self, points: Array) -> Array:
+        """Derivatives ``[points, k, dim]`` in natural coordinates, at natural coordinates."""
+        slopes = self.span.at(np.asarray(points, float))[1]
+        return np.einsum("qmd,mk->qkd", slopes, self._coefficients)
 
     def gradients_at(self, points: Array) -> Array:
         """Gradients ``[points, k, dim]`` in ideal coordinates, at natural coordinates."""
-        slopes = self._shape_functions(np.asarray(points, float))[1]
-        jacobian = np.einsum("kd,qke->qde", self.ideal, slopes)
-        return slopes @ np.linalg.inv(jacobian)
+        slopes = self.slopes_at(points)
+        return slopes @ np.linalg.inv(np.einsum("kd,qke->qde", self.ideal, slopes))
 
     @cached_property
     def quadrature(self) -> tuple[Array, Array]:
         """Natural points ``[q, dim]`` and weights ``[q]`` on the ideal element; they sum to 1."""
-        points, weights = RULES[self.name]
-        slopes = self._shape_functions(points)[1]
-        volume = np.linalg.det(np.einsum("kd,qke->qde", self.ideal, slopes))
-        return points, weights * volume
+        points, weights = self.rule
+        jacobians = np.einsum("kd,qke->qde", self.ideal, self.slopes)
+        return points, weights * np.linalg.det(jacobians)
 
     @cached_property
     def weights(self) -> Array:
@@ -313,37 +243,34 @@ class ElementType:
     def validity_gradients(self) -> Array:
         """Gradients ``[v, k, dim]`` where the Jacobian determinant has to be positive.
 
-        All nodes and quadrature points; one point where the Jacobian is constant."""
-        if self.order == 1 and self.corners == self.dim + 1:
+        All nodes and quadrature points; one point where the Jacobian is constant.  In place of a
+        singular corner points close to it on all its edges, which have the limits there; a linear
+        element needs none, as its Jacobian is constant on every line to that corner."""
+        if self.constant_jacobian:
             return self.gradients
-        nodes = self.natural
-        if self.shape is _SHAPES["pyramid"]:
-            apex = np.c_[_APEX * self.shape.corners[:4, :2], np.full(4, 1 - _APEX)]
-            nodes = np.concatenate([np.delete(nodes, 4, axis=0), apex])
-            if self.order == 1:
-                nodes = nodes[:4]
-        return np.concatenate([self.gradients_at(nodes), self.gradients])
+        nodes = [np.delete(self.natural, self.singular_corners, axis=0)]
+        for corner in self.singular_corners if not self.linear else ():
+            ends = self.natural[self._neighbours(corner)]
+            nodes.append(self.natural[corner] + APEX * (ends - self.natural[corner]))
+        return np.concatenate([self.gradients_at(np.concatenate(nodes)), self.gradients])
 
-    @property
-    def constant_jacobian(self) -> bool:
-        """Whether one Jacobian determinant holds for the whole element: straight simplices."""
-        return len(self.validity_gradients) == 1
+    def _neighbours(self, corner: int) -> list[int]:
+        """The corners that edges join to one."""
+        return [a + b - corner for a, b in self.family.edges if corner in (a, b)]
 
     @cached_property
     def corner_frames(self) -> Array:
         """Tangents of the edges leaving a corner: ``[c, k, dim]``, right-handed.
 
-        ``Xᵀ frame`` has the edge tangents as its columns.  The apex of a pyramid, where four
-        edges meet, is left out."""
-        count = 4 if self.shape is _SHAPES["pyramid"] else self.corners
-        slopes = self._shape_functions(self.natural[:count])[1]
+        ``Xᵀ frame`` has the edge tangents as its columns.  Singular corners are left out."""
         frames = []
-        for corner in range(count):
-            ends = [a + b - corner for a, b in self.shape.edges if corner in (a, b)]
-            directions = (self.natural[ends] - self.natural[corner]).T
+        for corner in range(self.corners):
+            if corner in self.singular_corners:
+                continue
+            directions = (self.natural[self._neighbours(corner)] - self.natural[corner]).T
             if np.linalg.det(directions) < 0:
                 directions = directions[:, [1, 0, *range(2, self.dim)]]
-            frames.append(slopes[corner] @ directions)
+            frames.append(self.slopes_at(self.natural[corner : corner + 1])[0] @ directions)
         return np.array(frames)
 
     @cached_property
@@ -372,20 +299,53 @@ class ElementType:
     @cached_property
     def slopes(self) -> Array:
         """Natural derivatives ``[q, k, dim]`` at the quadrature points (used for facets)."""
-        return self._shape_functions(RULES[self.name][0])[1]
+        return self.slopes_at(self.rule[0])
 
     @cached_property
     def slope_weights(self) -> Array:
         """Natural quadrature weights ``[q]`` that go with `slopes`."""
-        return RULES[self.name][1]
+        return self.rule[1]
 
 
-TYPES: dict[str, ElementType] = {
-    name: ElementType(name, order, centred, _SHAPES[shape]) for name, (shape, order, centred) in _ROWS.items()
-}
+TYPES: dict[str, ElementType] = {}
 
 
-@lru_cache
+def add_element_type(row: ElementType) -> ElementType:
+    """Add a row to the table, and return it: the type is known by its name everywhere then.
+
+    Args:
+        row: the type, with a name of its own; the types of its edges and facets have to be there.
+
+    Raises:
+        ValueError: the name is taken, the span doesn't fit the nodes or lacks linear functions, the
+            quadrature rule doesn't measure the ideal element, or an edge or facet has no type.
+    """
+    where = f"element type {row.name!r}"
+    if row.name in TYPES:
+        raise ValueError(f"{where} is in the table already; choose another name")
+    if (row.span.k, row.span.dim) != (row.k, row.dim):
+        raise ValueError(
+            f"{where} has {row.k} nodes in {row.dim}D, and its span {row.span.k} functions in "
+            f"{row.span.dim}D; give as many functions as nodes"
+        )
+    if np.linalg.cond(row.span.at(row.natural)[0]) > _SINGULAR:
+        raise ValueError(
+            f"{where}: values at its nodes don't tell functions of its span apart; mend the span"
+        )
+    points, values = row.rule[0], row.shape_functions(row.rule[0])
+    if max(np.abs(values.sum(axis=1) - 1).max(), np.abs(values @ row.natural - points).max()) > _SAME:
+        raise ValueError(f"{where}: its span lacks linear functions; add 1 and the natural coordinates")
+    if not abs(row.weights.sum() - 1) < _SAME:
+        raise ValueError(
+            f"{where}: its quadrature rule gives the ideal element a measure of {row.weights.sum():.6g}, not "
+            "1; give points and weights of the natural domain"
+        )
+    if row.dim > 1:  # what the edges and facets are is found now, or refused
+        row.edge_nodes, row.facets  # noqa: B018
+    TYPES[row.name] = row
+    return row
+
+
 def element_type(name: str) -> ElementType:
     """The row called `name` (meshio's name).  Raises `ValueError` for a type that has none."""
     if name not in TYPES:
@@ -396,3 +356,40 @@ def element_type(name: str) -> ElementType:
 def supported(dim: int | None = None) -> list[str]:
     """Names of the types that can be smoothed: all of them, or those of dimension `dim`."""
     return [name for name, row in TYPES.items() if row.dim > 1 and dim in (None, row.dim)]
+
+
+# --- The rows ---------------------------------------------------------------------------
+
+_CORNERS, _EDGES, _FACES = NodeRule(), NodeRule(edge=1), NodeRule(edge=1, quadrilateral=True)
+_ALL = NodeRule(edge=1, quadrilateral=True, cell=True)
+_P1, _P2 = "00 10 01", "00 10 01 20 11 02"
+_Q1, _Q2 = tensor("0 1", "0 1"), tensor("0 1 2", "0 1 2")
+_S3 = tensor(_Q1, "0 1") + " 200 210 201 211 020 120 021 121 002 102 012 112"
+# Both pyramids have all quadratic polynomials; xy is the difference of 110/1 and 111/1.  The larger span is
+# that of Bergot, Cohen and Duruflé (2010) of degree 2: its last function makes the trace on the base that
+# of a quad9, and is quadratic on the triangles, where x or y is ±(1 − z).
+_PYRAMID13 = "000 100 010 001 200 020 002 101 011 110/1 111/1 210/1 120/1"  # Bedrosian 1992
+_PYRAMID14 = _PYRAMID13 + " 220/2"
+_G2, _G3 = gauss(2), gauss(3)
+_ROWS: tuple[tuple[str, Family, NodeRule, str, Rule], ...] = (
+    ("line", LINE, _CORNERS, "0 1", gauss(1)),
+    ("line3", LINE, _EDGES, "0 1 2", gauss(4)),
+    ("triangle", TRIANGLE, _CORNERS, _P1, simplex_centre(2)),
+    ("triangle6", TRIANGLE, _EDGES, _P2, TRIANGLE_6),
+    ("quad", QUADRILATERAL, _CORNERS, _Q1, product(_G2, _G2)),
+    ("quad8", QUADRILATERAL, _EDGES, _Q1 + " 20 02 21 12", product(_G3, _G3)),
+    ("quad9", QUADRILATERAL, _FACES, _Q2, product(_G3, _G3)),
+    ("tetra", TETRAHEDRON, _CORNERS, "000 100 010 001", simplex_centre(3)),
+    ("tetra10", TETRAHEDRON, _EDGES, "000 100 010 001 200 020 002 110 011 101", TETRAHEDRON_14),
+    ("pyramid", PYRAMID, _CORNERS, "000 100 010 001 110/1", PYRAMID_4),
+    ("pyramid13", PYRAMID, _EDGES, _PYRAMID13, PYRAMID_27),
+    ("pyramid14", PYRAMID, _FACES, _PYRAMID14, PYRAMID_27),
+    ("wedge", WEDGE, _CORNERS, tensor(_P1, "0 1"), product(TRIANGLE_3, _G2)),
+    ("wedge15", WEDGE, _EDGES, tensor(_P2, "0 1") + " " + tensor(_P1, "2"), product(TRIANGLE_6, _G3)),
+    ("wedge18", WEDGE, _FACES, tensor(_P2, "0 1 2"), product(TRIANGLE_6, _G3)),
+    ("hexahedron", HEXAHEDRON, _CORNERS, tensor(_Q1, "0 1"), product(_G2, _G2, _G2)),
+    ("hexahedron20", HEXAHEDRON, _EDGES, _S3, product(_G3, _G3, _G3)),
+    ("hexahedron27", HEXAHEDRON, _ALL, tensor(_Q2, "0 1 2"), product(_G3, _G3, _G3)),
+)
+for _name, _family, _rule, _span, _points in _ROWS:
+    add_element_type(ElementType(_name, _family, _rule, Span.of(_span), _points))

@@ -21,6 +21,7 @@ __all__ = [
     "dimension",
     "element_dim",
     "parse_numbers",
+    "tell_meshio",
 ]
 
 # meshio refuses to build cells of a type whose dimension it doesn't list.  These gaps of its
@@ -45,6 +46,13 @@ SYNONYMS = {"tetra4": "tetra"}  # some of meshio's readers use another name
 
 class MeshFileError(ValueError):
     """A mesh that can't be read, used or written; the message is one sentence for its user."""
+
+
+def tell_meshio(name: str) -> None:
+    """Let meshio build cells of a type of the table that it doesn't list.
+
+    Raises `ValueError` for a type that the table lacks."""
+    topological_dimension.setdefault(name, element_type(name).dim)
 
 
 def dimension(name: str) -> int:

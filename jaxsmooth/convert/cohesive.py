@@ -37,7 +37,7 @@ def without_thickness(points: np.ndarray, blocks: Blocks) -> list[np.ndarray]:
         kept = []
         for (kind, nodes), axis in zip(blocks, found, strict=True):
             axis = axis.copy()
-            for d in _axes(kind):
+            for d in kind.extruded_axes:
                 rows = np.flatnonzero(axis == d)
                 through, within = _edges_along(kind, d)
                 gap = lengths(points, nodes[rows][:, through]).max(axis=1)
@@ -54,13 +54,6 @@ def without_thickness(points: np.ndarray, blocks: Blocks) -> list[np.ndarray]:
     return [axis >= 0 for axis in found]
 
 
-def _axes(kind: ElementType) -> range:
-    """Natural directions in which an element of this type can have no thickness."""
-    if kind.corners == 2**kind.dim:
-        return range(kind.dim)
-    return range(2, 3) if kind.corners == 6 else range(0)
-
-
 def _edges_along(kind: ElementType, axis: int) -> tuple[np.ndarray, np.ndarray]:
     """Edges along a natural direction, and the others, between corners ``[m, 2]``."""
     along = kind.natural[kind.edges[:, 0], axis] != kind.natural[kind.edges[:, 1], axis]
@@ -70,7 +63,7 @@ def _edges_along(kind: ElementType, axis: int) -> tuple[np.ndarray, np.ndarray]:
 def _closed(kind: ElementType, points: np.ndarray, nodes: np.ndarray, allowed: np.ndarray) -> np.ndarray:
     """For every element the natural direction in which its facing nodes coincide, or −1."""
     found = np.full(len(nodes), -1)
-    for axis in _axes(kind):
+    for axis in kind.extruded_axes:
         first = _edges_along(kind, axis)[0][0]
         close = lengths(points, nodes[:, first]) <= allowed[nodes[:, first]].max(axis=1)
         rows = np.flatnonzero(close & (found < 0))  # one edge tells most elements out

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from jaxsmooth.cells.table import ElementType, element_type
+from jaxsmooth.cells.table import ElementType
 from jaxsmooth.mesh.topology import Facets, lengths
 from jaxsmooth.numerics.rounding import CLOSE, ROUNDINGS, coordinate_error
 
@@ -121,13 +121,8 @@ def find_hanging(
 
 def _edges_of(kind: ElementType, facets: np.ndarray) -> tuple[ElementType, np.ndarray]:
     """The edges of facets with all their nodes, those of all facets side by side."""
-    if kind.dim == 1:
-        return kind, facets
-    columns = kind.edges
-    if kind.order == 2:
-        columns = np.concatenate([columns, kind.corners + np.arange(len(columns))[:, None]], axis=1)
-    edges = facets[:, columns].swapaxes(0, 1).reshape(-1, columns.shape[1])
-    return element_type("line3" if kind.order == 2 else "line"), edges
+    line, columns = kind.edge_nodes.type, kind.edge_nodes.nodes
+    return line, facets[:, columns].swapaxes(0, 1).reshape(-1, columns.shape[1])
 
 
 def _doubled(points: np.ndarray, segments: list[np.ndarray], edges: list[np.ndarray]) -> np.ndarray:
@@ -217,7 +212,7 @@ def _foot(kind: ElementType, facets: np.ndarray, points: np.ndarray) -> tuple[np
     """Natural coordinates of the points of facets ``[m, k, dim]`` next to ``[m, dim]``; distances."""
     natural = np.tile(kind.natural[: kind.corners].mean(axis=0), (len(points), 1))
     for _ in range(_ITERATIONS):
-        values, slopes = kind._shape_functions(natural)
+        values, slopes = kind.shape_functions(natural), kind.slopes_at(natural)
         missing = points - np.einsum("mk,mkd->md", values, facets)
         tangents = np.einsum("mke,mkd->mde", slopes, facets)
         natural = natural + np.einsum("med,md->me", np.linalg.pinv(tangents), missing)
@@ -227,6 +222,4 @@ def _foot(kind: ElementType, facets: np.ndarray, points: np.ndarray) -> tuple[np
 
 
 def _interior(kind: ElementType, natural: np.ndarray) -> np.ndarray:
-    if kind.dim == 2 and kind.corners == 3:
-        return (natural.min(axis=1) > _CHORD) & (natural.sum(axis=1) < 1 - _CHORD)
-    return (np.abs(natural) < 1 - _CHORD).all(axis=1)
+    return kind.family.margin(natural) > _CHORD

@@ -16,7 +16,6 @@ import jax
 import meshio
 import numpy as np
 
-from jaxsmooth.cells.table import element_type
 from jaxsmooth.convert.blocks import collected, count_orphans, oriented, placed, without_cohesive
 from jaxsmooth.convert.checks import (
     SYNONYMS,
@@ -25,6 +24,7 @@ from jaxsmooth.convert.checks import (
     check_points,
     dimension,
     element_dim,
+    tell_meshio,
 )
 from jaxsmooth.convert.coupling import find_coupled
 from jaxsmooth.convert.labels import held_nodes, make_labels, make_named_sets, plain
@@ -218,7 +218,7 @@ def _from_pair(points: Any, blocks: Any) -> meshio.Mesh:
     cells = [(str(name), np.asarray(nodes)) for name, nodes in pairs]
     for index, (name, nodes) in enumerate(cells):
         if name not in SYNONYMS and name != "vertex":
-            element_type(name)  # raises for unknown names
+            tell_meshio(name)  # raises for unknown names
         if nodes.ndim != 2 or nodes.dtype.kind not in "iu":
             raise ValueError(
                 f"block {index} ({name}): connectivity must be integers of shape [elements, k], "

@@ -24,7 +24,7 @@ from jaxsmooth.convert.checks import MeshFileError, check_last_line, check_refer
 from jaxsmooth.files.formats.abaqus import is_abaqus, read_abaqus
 from jaxsmooth.files.formats.exodus import read_exodus
 from jaxsmooth.files.formats.medit import read_medit
-from jaxsmooth.files.formats.msh import keep_groups, read_msh_data, repaired_msh, sniff_msh
+from jaxsmooth.files.formats.msh import in_vtk_order, keep_groups, read_msh_data, repaired_msh, sniff_msh
 from jaxsmooth.files.formats.mshraw import check_msh, entity_groups
 from jaxsmooth.files.formats.su2 import read_su2
 from jaxsmooth.files.formats.ugrid import is_text, read_ugrid
@@ -32,7 +32,6 @@ from jaxsmooth.files.formats.vtk import check_vtk, check_vtu
 from jaxsmooth.files.formats.xdmf import read_xdmf
 
 __all__ = [
-    "NPZ_TYPES",
     "detect_format",
     "format_of_suffix",
     "quiet",
@@ -41,7 +40,6 @@ __all__ = [
     "stem_format",
 ]
 
-NPZ_TYPES = ("vertex", *TYPES)
 _TEXT = {"avsucd", "flac3d", "mdpa", "nastran", "netgen", "permas", "tecplot"}
 _ENDS = {"nastran": b"\nENDDATA", "netgen": b"\nendmesh"}  # meshio waits for the first for ever
 
@@ -199,6 +197,7 @@ def _read_gmsh(path: Path, name: str) -> tuple[meshio.Mesh, list[str]]:
     else:
         mesh = _read_copy(repaired, path, name)
         mesh.cell_data.update(read_msh_data(content, mesh))
+    in_vtk_order(mesh)
     keep_groups(mesh, entity_groups(content))
     return mesh, []
 
@@ -227,7 +226,7 @@ def _read_npz(path: Path, name: str) -> tuple[meshio.Mesh, list[str]]:
     if "points" not in content:
         raise ValueError("the archive has no array called 'points'")
     points = content.pop("points")
-    names = [key for key in content if key in NPZ_TYPES]
+    names = [key for key in content if key == "vertex" or key in TYPES]
     cells = [(key, content.pop(key)) for key in names]
     point_data, cell_data = {}, {}
     for key, values in content.items():

@@ -10,14 +10,17 @@ from pathlib import Path
 import meshio
 import numpy as np
 from meshio._helpers import _writer_map, reader_map
+from meshio._vtk_common import vtk_to_meshio_type
+from meshio.gmsh.common import _meshio_to_gmsh_type
+from meshio.xdmf.common import meshio_to_xdmf_type
 
-from jaxsmooth.cells.table import supported
+from jaxsmooth.cells.table import TYPES, supported
 from jaxsmooth.convert.checks import SYNONYMS, MeshFileError
 from jaxsmooth.convert.regions import NOT_SETS, SECTIONS, plain, recall
 from jaxsmooth.files.formats.abaqus import ABAQUS_TYPES, write_abaqus
 from jaxsmooth.files.formats.exodus import write_exodus
 from jaxsmooth.files.formats.medit import MEDIT_SETS, append_medit_sets
-from jaxsmooth.files.formats.msh import split_by_entity, write_data_sections, write_msh41
+from jaxsmooth.files.formats.msh import in_gmsh_order, split_by_entity, write_data_sections, write_msh41
 from jaxsmooth.files.formats.su2 import SU2_REST, write_su2
 from jaxsmooth.files.formats.ugrid import is_text, write_ugrid
 from jaxsmooth.files.reading import quiet, read_format, stem_format
@@ -35,16 +38,25 @@ from jaxsmooth.files.reduction import (
 __all__ = ["check_types", "check_writable", "write_source"]
 
 _LINEAR = {"line", "triangle", "quad", "tetra", "wedge", "pyramid", "hexahedron"}
+_QUADRATIC = {"line3", "triangle6", "quad8", "tetra10", "pyramid13", "wedge15", "hexahedron20"}
+_CENTRED = {"quad9", "hexahedron27"}
 _HOLDS = {
-    "abaqus": {"line", "line3", *supported()},
+    "abaqus": _LINEAR | _QUADRATIC | _CENTRED,
     "avsucd": {"vertex", *_LINEAR},
-    "exodus": {"vertex", "line", "line3", *supported()},
+    "exodus": {"vertex", "pyramid14", "wedge18"} | _LINEAR | _QUADRATIC | _CENTRED,
     "medit": _LINEAR,
-    "nastran": _LINEAR | {"line3", "triangle6", "quad8", "tetra10", "hexahedron20", "wedge15", "pyramid13"},
+    "nastran": _LINEAR | _QUADRATIC,
     "su2": _LINEAR,
     "ugrid": _LINEAR - {"line"},
 }
 """Cell types of formats that hold only some of those that this package knows."""
+
+_MESHIO = {
+    **{stem: set(vtk_to_meshio_type.values()) for stem in VTK_FORMATS},
+    **{stem: set(_meshio_to_gmsh_type) for stem in ("gmsh", "gmsh22")},
+    "xdmf": set(meshio_to_xdmf_type),
+}
+"""The same as meshio's tables say, which have other cells than this package's, too."""
 
 _SURFACES = {"stl", "obj", "off", "ply", "svg", "wkt", "neuroglancer"}
 _ONE_BLOCK = {"med", "hmf", "h5m"}  # of a type
@@ -77,11 +89,25 @@ def check_types(names: Iterable[str], path: Path, format: str) -> None:
         )
     if stem in _SURFACES:
         raise MeshFileError(f"{path}: {stem} files hold surfaces only; write .vtu, .msh or .xdmf instead")
-    missing = [n for n in names if stem in _HOLDS and n in supported() and n not in _HOLDS[stem]]
+    missing = [n for n in names if n in supported() and not _holds(stem, n)]
     if missing:
         raise MeshFileError(
-            f"{path}: {stem} files can't hold {missing[0]} elements; write .vtu, .msh or .xdmf instead"
+            f"{path}: {stem} files can't hold {missing[0]} elements; write {_instead(missing)} instead"
         )
+
+
+def _holds(stem: str, name: str) -> bool:
+    """Whether a format has cells of a type, as far as is known before it is written."""
+    if name in TYPES and stem in _MESHIO:
+        return name in _MESHIO[stem]
+    return name in _HOLDS.get(stem, {name})
+
+
+def _instead(names: Iterable[str]) -> str:
+    """The formats to recommend for elements of these types."""
+    suffixes = {"vtu": ".vtu", "gmsh22": ".msh", "xdmf": ".xdmf"}
+    able = [suffix for stem, suffix in suffixes.items() if all(_holds(stem, name) for name in names)]
+    return " or ".join(filter(None, (", ".join(able[:-1]), *able[-1:]))) or ".npz"
 
 
 def write_source(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> list[str]:
@@ -131,7 +157,7 @@ def _clean(mesh: meshio.Mesh, stem: str, dim: int, notes: list[str]) -> meshio.M
     """A copy with native arrays that every writer takes, without cells that the format lacks."""
     out = copy.copy(mesh)
     kept = [k for k, cells in enumerate(mesh.cells) if len(cells)]
-    lacking = [k for k in kept if mesh.cells[k].type not in _HOLDS.get(stem, {mesh.cells[k].type})]
+    lacking = [k for k in kept if not _holds(stem, mesh.cells[k].type)]
     if lacking:
         names = ", ".join(sorted({mesh.cells[k].type for k in lacking}))
         notes.append(f"{stem} files can't hold {names} cells; they are not written")
@@ -269,6 +295,7 @@ def _write_xdmf(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> None:
 
 def _write_gmsh(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> None:
     binary = not format.endswith(":ascii")
+    in_gmsh_order(mesh)
     _tag(mesh, dim)
     if stem_format(format) == "gmsh":
         write_msh41(path, split_by_entity(mesh), binary)

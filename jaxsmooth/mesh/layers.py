@@ -162,12 +162,10 @@ def nodes_of(mesh: Mesh, masks: Sequence[np.ndarray]) -> np.ndarray:
 def _flat(kind: ElementType, nodes: np.ndarray, points: np.ndarray, chosen: np.ndarray):
     """Of chosen elements: their rows, the lowest corners of two large facets ``[m, 2, dim]``, thickness."""
     rows = np.flatnonzero(chosen)
-    if kind.corners not in (2**kind.dim, 6):
-        rows = rows[:0]
     heights = np.stack([_height(kind, points[nodes[rows]], axis) for axis in range(kind.dim)], axis=1)
     thin = heights.argmin(axis=1)
-    if kind.corners == 6:  # between two triangles
-        rows, heights, thin = rows[thin == 2], heights[thin == 2], thin[thin == 2]
+    between = np.isin(thin, kind.extruded_axes)  # wedges are between their triangles only
+    rows, heights, thin = rows[between], heights[between], thin[between]
     sides = np.zeros((len(rows), 2, kind.dim), np.int64)
     natural = kind.natural[: kind.corners]
     for axis in np.unique(thin):
@@ -188,7 +186,7 @@ def _height(kind: ElementType, nodes: np.ndarray, axis: int) -> np.ndarray:
 def _upright(kind: ElementType, points: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """Stretched elements whose corners are near to right angles ``[elements]``."""
     found = np.zeros(len(nodes), bool)
-    if kind.corners in (2**kind.dim, 6):
+    if kind.extruded_axes:
         rows = np.flatnonzero(_stretched(kind, points, nodes, STRETCHED))
         ideal = _least_sine(kind, kind.ideal[None])
         found[rows] = _least_sine(kind, points[nodes[rows]]) > _SQUARE * ideal

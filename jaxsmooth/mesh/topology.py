@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxsmooth.cells.table import ElementType, element_type
+from jaxsmooth.cells.table import ElementType
 from jaxsmooth.mesh.record import Mesh
 
 __all__ = ["Facets", "facet_keys", "find_facets", "lengths", "node_pairs", "pair_codes", "signed_measures"]
@@ -39,15 +39,14 @@ def find_facets(mesh: Mesh) -> list[Facets]:
     Two elements share a facet when they share its corner nodes.  Boundary facets have
     ``partner == -1``.
     """
-    owners: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+    owners: dict[ElementType, list[tuple[np.ndarray, np.ndarray]]] = {}
     for (kind, nodes), region in zip(mesh.blocks, _regions(mesh), strict=True):
         nodes = np.asarray(nodes)
         for group in kind.facets:
             sides = nodes[:, group.nodes].reshape(-1, group.nodes.shape[1])
-            owners.setdefault(group.type.name, []).append((sides, np.repeat(region, len(group.nodes))))
+            owners.setdefault(group.type, []).append((sides, np.repeat(region, len(group.nodes))))
     found = []
-    for name, parts in owners.items():
-        kind = element_type(name)
+    for kind, parts in owners.items():
         nodes = np.concatenate([p[0] for p in parts])
         region = np.concatenate([p[1] for p in parts])
         found.append([kind, nodes, region])

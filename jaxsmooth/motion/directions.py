@@ -185,7 +185,7 @@ def facet_normals(kind: ElementType, nodes: np.ndarray, noise: Noise, flatness: 
     corners = nodes[:, : kind.corners]
     longest = np.linalg.norm(corners[:, kind.edges[:, 0]] - corners[:, kind.edges[:, 1]], axis=-1).max(axis=1)
     height = longest if area is None else area / np.maximum(longest, np.finfo(float).tiny)
-    if kind.order == 2:  # tangents at the ends magnify what a mid-side node is off by
+    if not kind.linear:  # tangents at the ends magnify what a mid-side node is off by
         height = height / 4
     return _known(normals, size, height, noise, flatness)
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from jaxsmooth.cells.table import ElementType
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.mesh.topology import find_facets
 from jaxsmooth.metrics.table import quality
@@ -76,7 +75,7 @@ def draw_mesh(
     if mesh.dim == 2:
         shapes, values = [], []
         for (kind, nodes), q in zip(mesh.blocks, quality(mesh), strict=True):
-            shapes += list(np.asarray(mesh.points)[np.asarray(nodes)[:, _ring(kind)]])
+            shapes += list(np.asarray(mesh.points)[np.asarray(nodes)[:, kind.outline]])
             values.append(np.asarray(q))
         faces = _QUALITY(colours(np.concatenate(values)))
     else:
@@ -113,13 +112,6 @@ def _add(axis: Axes, shapes: list[np.ndarray], faces: Any, edge: str, width: flo
     return drawn
 
 
-def _ring(kind: ElementType) -> list[int]:
-    """Nodes around a 2D element, mid-side nodes between the corners."""
-    if kind.order == 1:
-        return list(range(kind.corners))
-    return [node for i in range(kind.corners) for node in (i, kind.corners + i)]
-
-
 def _element_facets(
     mesh: Mesh, limit: float | None, view: tuple[float, float], outer: bool
 ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
@@ -136,8 +128,7 @@ def _element_facets(
 
     groups: list[tuple[np.ndarray, np.ndarray]] = []
     if outer:
-        boundary = {facets.type.name: facets for facets in find_facets(mesh)}
-        for facets in boundary.values():
+        for facets in find_facets(mesh):
             chosen = facets.nodes[facets.partner < 0][:, : facets.type.corners]
             groups.append((chosen, np.ones(len(chosen))))
     else:

@@ -80,15 +80,15 @@ def extend_exodus() -> None:
 def _bend(points: np.ndarray, nodes: np.ndarray, name: str) -> float:
     """Mean distance of nodes from where straight elements have them."""
     kind = element_type(name)
-    linear = element_type(kind.name.rstrip("0123456789"))
-    shape = linear.shape_functions(kind.natural)
-    straight = np.einsum("ac,ecd->ead", shape, points[nodes[:, : linear.k]])
+    straight = np.einsum("ac,ecd->ead", kind.straight, points[nodes[:, : kind.corners]])
     return float(np.linalg.norm(points[nodes] - straight, axis=-1).mean())
 
 
 _HEX20 = [*range(12), 16, 17, 18, 19, 12, 13, 14, 15]
+_WEDGE15 = [*range(9), 12, 13, 14, 9, 10, 11]
 EXODUS_ORDER = {
-    "wedge15": [*range(9), 12, 13, 14, 9, 10, 11],
+    "wedge15": _WEDGE15,
+    "wedge18": [*_WEDGE15, 15, 16, 17],
     "hexahedron20": _HEX20,
     "hexahedron27": [*_HEX20, 26, 24, 25, 20, 21, 22, 23],
 }
@@ -102,6 +102,8 @@ _EXODUS_NAMES = {
     "TET10": "tetra10",
     "PYRAMID5": "pyramid",
     "PYRAMID13": "pyramid13",
+    "PYRAMID14": "pyramid14",
     "WEDGE6": "wedge",
     "WEDGE15": "wedge15",
+    "WEDGE18": "wedge18",
 }

@@ -5,6 +5,7 @@
   those get the group 0, which is how meshio says "none".
 - 4.1 written by meshio can't be read again when an entity has no nodes of its own, when one has
   cells of two types, or when the source wasn't 4.1; hence the writer here.
+- Nodes of two types are left in Gmsh's order; they are put in VTK's here, and back.
 """
 
 from __future__ import annotations
@@ -16,11 +17,13 @@ from pathlib import Path
 
 import meshio
 import numpy as np
-from meshio.gmsh.common import _meshio_to_gmsh_order, _meshio_to_gmsh_type
+from meshio.gmsh.common import _gmsh_to_meshio_order, _meshio_to_gmsh_order, _meshio_to_gmsh_type
 
 from jaxsmooth.convert.regions import GROUPS, recall
 
 __all__ = [
+    "in_gmsh_order",
+    "in_vtk_order",
     "keep_groups",
     "read_msh_data",
     "repaired_msh",
@@ -106,6 +109,31 @@ def keep_groups(mesh: meshio.Mesh, groups: dict[tuple[int, int], list[int]]) -> 
             least = min(several[key], key=lambda group, dim=key[0]: sizes[dim, group])
             mesh.cell_data["gmsh:physical"][k] = np.full(len(mesh.cells[k]), least)
     mesh.info = {GROUPS: several}
+
+
+_VTK_ORDER = {
+    "pyramid14": [0, 1, 2, 3, 4, 5, 8, 10, 6, 7, 9, 11, 12, 13],
+    "wedge18": [0, 1, 2, 3, 4, 5, 6, 9, 7, 12, 14, 13, 8, 10, 11, 15, 17, 16],
+}
+"""Gmsh's nodes in VTK's order, of the types that meshio leaves in Gmsh's."""
+
+
+def in_vtk_order(mesh: meshio.Mesh) -> None:
+    """Put the nodes of what meshio read in VTK's order where it has not."""
+    _reorder(mesh, _VTK_ORDER)
+
+
+def in_gmsh_order(mesh: meshio.Mesh) -> None:
+    """Put the nodes in Gmsh's order where meshio's writer would not."""
+    _reorder(mesh, {name: np.argsort(order) for name, order in _VTK_ORDER.items()})
+
+
+def _reorder(mesh: meshio.Mesh, orders) -> None:
+    for k, cells in enumerate(mesh.cells):
+        if cells.type in orders:
+            count = np.arange(len(orders[cells.type]))[None]
+            if np.array_equal(_gmsh_to_meshio_order(cells.type, count), count):
+                mesh.cells[k] = meshio.CellBlock(cells.type, cells.data[:, orders[cells.type]])
 
 
 def _with_physical_groups(content: bytes, binary: bool, size: int) -> bytes:

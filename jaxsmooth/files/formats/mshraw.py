@@ -28,7 +28,7 @@ class _Section:
         if not binary:
             self.numbers = parse_numbers(self.body, f"its section ${name}")
 
-    def take(self, count: int, kind: str = "i") -> np.ndarray:
+    def take(self, count: int | np.integer, kind: str = "i") -> np.ndarray:
         """The next numbers: ``i`` integers, ``n`` sizes and tags, ``d`` coordinates."""
         if self.binary:
             dtype = np.dtype({"i": "<i4", "n": f"<u{self.size}", "d": "<f8"}[kind])
@@ -147,7 +147,7 @@ def _elements2(section: _Section) -> Iterator[np.ndarray]:
     section.end()
 
 
-def _nodes_of(code: int) -> int:
+def _nodes_of(code: int | np.integer) -> int:
     if code not in _gmsh_to_meshio_type:
         raise ValueError(f"elements of Gmsh's type {code} are not supported")
     return num_nodes_per_cell[_gmsh_to_meshio_type[code]]

@@ -70,10 +70,9 @@ def _slope(det: Array, eps: Array | float) -> Array:
 def isoperimetric(kind: ElementType, metric: str) -> bool:
     """Whether the paper's q serves as the metric.
 
-    It does where it is largest on the ideal element: not for wedges and pyramids, nor for
-    quadratic elements, which raise it by bulging.
+    It does where it is largest on the ideal element.
     """
-    return metric == "shape" and kind.name in ("triangle", "quad", "tetra", "hexahedron")
+    return metric == "shape" and kind.ideal_is_optimum
 
 
 def _bounded(kind: ElementType, metric: str) -> bool:
@@ -84,15 +83,15 @@ def _bounded(kind: ElementType, metric: str) -> bool:
 
 def _sampled(kind: ElementType, metric: str) -> bool:
     """Whether the metric looks at the Jacobian at sample points: where it varies, or alone counts."""
-    return not isoperimetric(kind, metric) or len(kind.validity_gradients) > 1
+    return not isoperimetric(kind, metric) or not kind.constant_jacobian
 
 
 def _points(kind: ElementType) -> np.ndarray:
     """Gradients at the sample points: the nodes of linear elements, nodes and quadrature points
-    of quadratic ones.  Validity is tested at both in any case."""
+    of others.  Validity is tested at both in any case."""
     every = kind.validity_gradients
     nodal = len(every) - len(kind.gradients)
-    return every[:nodal] if kind.order == 1 and nodal else every
+    return every[:nodal] if kind.linear and nodal else every
 
 
 def _excess(ratio: Scalar) -> tuple[Scalar, Scalar, Scalar]:
