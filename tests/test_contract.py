@@ -121,7 +121,8 @@ def test_an_ideal_mesh_stays(name):
     mesh = js.Mesh(points, {"triangle": [[0, 1 + i, 1 + (i + 1) % 6] for i in range(6)]})
     found = js.run(mesh, METHODS[name](), constraints=js.Constraints.hold(mesh, []), steps=1)
     if name in ("elastic", "elastic-extended", "optimize"):
-        np.testing.assert_allclose(found.points, points, atol=1e-9)
+        # a minimum is known to the root of the rounding of its value
+        np.testing.assert_allclose(found.points, points, atol=1e-7 if name == "optimize" else 1e-9)
     else:  # the mean of what surrounds a corner lies inside
         np.testing.assert_allclose(found.points[0], 0, atol=1e-12)
 

@@ -270,7 +270,7 @@ def test_given_up_elements_stay_finite_and_leave_the_others_alone():
     assert inverted[0].any()
     assert jnp.isfinite(value)
     np.testing.assert_allclose(worst, dets[0][~inverted[0]].min(), rtol=1e-12)
-    np.testing.assert_array_equal(relieved.blocks[0].relief > 0, inverted[0])
+    np.testing.assert_array_equal(relieved.blocks[0].data.relief > 0, inverted[0])
     assert task.inverted(mesh.points, inverted) == 0
     assert task.inverted(mesh.points, tuple(~part for part in inverted)) == inverted[0].sum()
     found = Newton()(relieved, mesh.points)
