@@ -2,35 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from jaxtyping import Array, Float
 
 from jaxsmooth.numerics.rotation import rotation
 
-__all__ = ["fit", "target_element"]
+__all__ = ["moments", "placed", "target_element"]
 
 Matrix = Float[Array, "dim dim"]
 
 
-def fit(
-    reference: Float[Array, "k dim"], nodes: Float[Array, "k dim"], rotate=rotation
-) -> tuple[Matrix, Float[Array, " dim"]]:
-    """Rotation and translation that place `reference` closest to `nodes`.
+def moments(ideal: Float[Array, "k dim"], nodes: Float[Array, "k dim"]) -> Matrix:
+    """H of Eqs. 23–27: what the rotation of the fit depends on, whatever the size of the ideal element."""
+    return (_centred(ideal)[:, :, None] * _centred(nodes)[:, None, :]).sum(axis=0)
 
-    They minimise Eq. 7, with H from Eqs. 23–27 and T from Eq. 28.
-    """
-    centre, reference_centre = nodes.mean(axis=0), reference.mean(axis=0)
-    moments = ((reference - reference_centre)[:, :, None] * (nodes - centre)[:, None, :]).sum(axis=0)
-    r = rotate(moments)
-    return r, centre - r @ reference_centre
+
+def placed(
+    ideal: Float[Array, "k dim"], nodes: Float[Array, "k dim"], scale: Float[Array, ""], rotation: Matrix
+) -> Float[Array, "k dim"]:
+    """C of Eq. 29: the ideal element, scaled by α s (Eqs. 22, 36), rotated, and moved by T of Eq. 28."""
+    turned = (_centred(ideal)[:, None, :] * rotation).sum(axis=-1)
+    return scale * turned + nodes.mean(axis=0)
 
 
 def target_element(
     ideal: Float[Array, "k dim"],
     nodes: Float[Array, "k dim"],
     scale: Float[Array, ""],
-    rotate=rotation,
+    rotate: Callable[[Matrix], Matrix] = rotation,
 ) -> Float[Array, "k dim"]:
-    """The ideal element, scaled by `scale` (α s of Eqs. 22, 36) and fitted: C of Eq. 29."""
-    reference = scale * ideal
-    r, t = fit(reference, nodes, rotate)
-    return (reference[:, None, :] * r).sum(axis=-1) + t
+    """The ideal element of a size where it is closest to `nodes`: it minimises Eq. 7."""
+    return placed(ideal, nodes, scale, rotate(moments(ideal, nodes)))
+
+
+def _centred(nodes: Float[Array, "k dim"]) -> Float[Array, "k dim"]:
+    return nodes - nodes.mean(axis=0)

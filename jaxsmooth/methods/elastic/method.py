@@ -10,19 +10,21 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsmooth.assembly import cut, gather, scatter_add
+from jaxsmooth.assembly import Chunks, cut, each, gather, mapped, scan
 from jaxsmooth.guards.acceptance import AcceptanceRule
 from jaxsmooth.guards.base import Guard
 from jaxsmooth.guards.patch import PatchGuard
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.methods.base import Method, Proposal
 from jaxsmooth.methods.elastic.elasticity import Material, Operator, element_force, linearise
-from jaxsmooth.methods.elastic.fitting import target_element
+from jaxsmooth.methods.elastic.fitting import moments, placed
 from jaxsmooth.metrics.evaluation import Evaluation
 from jaxsmooth.metrics.table import shape_quality
 from jaxsmooth.motion.base import Motion
+from jaxsmooth.numerics.rotation import rotation
 from jaxsmooth.numerics.small import Frame, least
 from jaxsmooth.numerics.solve import gradient_tolerance, solve_projected
 from jaxsmooth.targets import OwnSize, Target
@@ -72,21 +74,26 @@ class Elastic(Method):
         frame = Frame.of(mesh.points)
         mesh, motion = mesh.with_points(frame.into(mesh.points)), motion.within(frame)
         count = len(mesh.points)
-        force = jnp.zeros_like(mesh.points)
-        blocks = []
-        weights = self.priorities(mesh) if self.extended else (None,) * len(mesh.blocks)
         sizes = self.target.measures(mesh, frame)
-        for (kind, nodes), weight, size in zip(mesh.blocks, weights, sizes, strict=True):
-            corners = gather(mesh.points, nodes)
-            ideal = jnp.asarray(kind.ideal, corners.dtype)
-            scale = self.alpha * size ** (1 / kind.dim)
-            target = jax.vmap(target_element, in_axes=(None, 0, 0))(ideal, corners, scale)
-            elements = jax.vmap(partial(linearise, kind))(corners, size)
-            pull = jax.vmap(element_force, in_axes=(0, 0, None))(elements, target - corners, self.material)
-            if self.extended:
-                pull = pull * weight[:, None, None]
-            force = force + scatter_add(pull, nodes, count)
-            blocks.append(cut(nodes, elements, mesh.execution))
+        rotations = _rotations(mesh)
+        weights = self.priorities(mesh) if self.extended else tuple(jnp.ones_like(part) for part in sizes)
+        force, blocks = jnp.zeros_like(mesh.points), []
+        for (kind, nodes), *data in zip(mesh.blocks, sizes, rotations, weights, strict=True):
+
+            def pull(element, nodes, kind=kind):
+                size, turn, weight = element
+                scale = self.alpha * size ** (1 / kind.dim)
+                target = placed(jnp.asarray(kind.ideal, nodes.dtype), nodes, scale, turn)
+                linear = linearise(kind, nodes, size)
+                return weight * element_force(linear, target - nodes, self.material), linear
+
+            def add(total, chunk, pull=pull):
+                forces, elements = jax.vmap(pull)(chunk.data, chunk.local)
+                return chunk.add(total, forces), elements
+
+            chunks = cut(nodes, tuple(data), mesh.execution)
+            force, elements = scan(add, force, chunks, mesh.points)
+            blocks.append(Chunks(chunks.nodes, elements, chunks.count))
         operator = Operator(tuple(blocks), self.material)
         found = solve_projected(
             operator,
@@ -108,3 +115,15 @@ class Elastic(Method):
         gap = 1 - least(jnp.concatenate(q))
         perfect = gap <= 0
         return tuple(jnp.where(perfect, 0, (1 - part) / jnp.where(perfect, 1, gap)) for part in q)
+
+
+def _rotations(mesh: Mesh) -> list[Float[Array, "_ dim dim"]]:
+    """Of the fitted ideal elements (Eq. 14, corrected); all blocks together, for it is a large program."""
+    found = []
+    for kind, nodes in mesh.blocks:
+        ideal = jnp.asarray(kind.ideal, mesh.points.dtype)
+        function = partial(lambda ideal, _, local: moments(ideal, local), ideal)
+        found.append(each(function, cut(nodes, None, mesh.execution), mesh.points))
+    turned = mapped(rotation, jnp.concatenate(found), mesh.execution)
+    ends = np.cumsum([len(part) for part in found])[:-1]
+    return jnp.split(turned, ends)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsmooth.assembly import Chunks, cut, gather, scan, sum_to_nodes
+from jaxsmooth.assembly import Chunk, Chunks, cut, gather, scan, sum_to_nodes
 from jaxsmooth.cells.table import ElementType
 from jaxsmooth.mesh.execution import Execution
 from jaxsmooth.mesh.record import Mesh
@@ -94,11 +94,11 @@ class Problem(eqx.Module):
     metric: str = eqx.field(static=True)
 
     def _scan(self, function: Callable[..., Any], start: Any, points: Field) -> Any:
-        """Carry `start` through all chunks: ``(carry, kind, nodes, data, corners) -> carry``."""
+        """Carry `start` through all chunks: ``(carry, kind, chunk) -> carry``."""
         for kind, block in zip(self.kinds, self.blocks, strict=True):
 
-            def add(carry, nodes, data, corners, kind=kind):
-                return function(carry, kind, nodes, data, _whole(kind, data.weight, corners)), None
+            def add(carry, chunk, kind=kind):
+                return function(carry, kind, _sound(kind, chunk)), None
 
             start, _ = scan(add, start, block, points)
         return start
@@ -156,13 +156,15 @@ class Problem(eqx.Module):
     def value(self, points: Field, eps: Scalar) -> tuple[Scalar, Scalar]:
         """The objective, and the least determinant over its target's (of weighted elements)."""
 
-        def add(carry, kind, _, data, corners):
+        def add(carry, kind, chunk):
+            data = chunk.data
+
             def element(nodes, size, relief):
                 eps_here = jnp.maximum(eps, relief)
                 e, _ = inverse_quality(kind, self.metric, self.size_weight, nodes, size, eps_here)
                 return self.aggregation(e), _least_determinant(kind, nodes) / size
 
-            energy, det = jax.vmap(element)(corners, data.size, data.relief)
+            energy, det = jax.vmap(element)(chunk.local, data.size, data.relief)
             total, worst = carry
             counts = (data.weight > 0) & (data.relief == 0)
             worst = jnp.minimum(worst, jnp.where(counts, det, jnp.inf).min())
@@ -173,17 +175,18 @@ class Problem(eqx.Module):
     def value_and_grad(self, points: Field, eps: Scalar) -> tuple[Scalar, Field]:
         """The objective and its gradient with respect to all points."""
 
-        def add(carry, kind, nodes, data, corners):
+        def add(carry, kind, chunk):
+            data = chunk.data
+
             def element(nodes, size, relief):
                 eps_here = jnp.maximum(eps, relief)
                 e, gradient = inverse_quality(kind, self.metric, self.size_weight, nodes, size, eps_here)
                 return self.aggregation(e), self.aggregation.derivatives(e)[0] * gradient
 
-            energies, slopes = jax.vmap(element)(corners, data.size, data.relief)
+            energies, slopes = jax.vmap(element)(chunk.local, data.size, data.relief)
             total, gradient = carry
             slopes = data.weight[:, None, None] * slopes
-            gradient = gradient.at[nodes].add(slopes, mode="promise_in_bounds")
-            return total + data.weight @ energies, gradient
+            return total + data.weight @ energies, chunk.add(gradient, slopes)
 
         start = (jnp.zeros((), points.dtype), jnp.zeros_like(points))
         return self._scan(add, start, points)
@@ -199,14 +202,14 @@ class Problem(eqx.Module):
                     first, second = self.aggregation.derivatives(e)
                     return data.weight * first, data.weight * second
 
-                nodes, eps_here = _whole(kind, data.weight, nodes), jnp.maximum(eps, data.relief)
+                eps_here = jnp.maximum(eps, data.relief)
                 args = (kind, self.metric, self.size_weight, aggregate)
                 model = hessian_model(*args, nodes, data.size, eps_here)
                 return model, model_diagonal(kind, model)
 
-            def add(total, nodes, data, corners, element=element):
-                model, diagonal = jax.vmap(element)(corners, data)
-                return total.at[nodes].add(diagonal, mode="promise_in_bounds"), model
+            def add(total, chunk, kind=kind, element=element):
+                model, diagonal = jax.vmap(element)(_sound(kind, chunk).local, chunk.data)
+                return chunk.add(total, diagonal), model
 
             total, model = scan(add, total, block, points)
             models.append(Chunks(block.nodes, model, block.count))
@@ -232,6 +235,10 @@ def _whole(kind: ElementType, weight: Array, nodes: Array) -> Array:
     """The ideal element in place of one without weight, which may be degenerate."""
     shape = (*weight.shape, *(1,) * (nodes.ndim - weight.ndim))
     return jnp.where(weight.reshape(shape) > 0, nodes, jnp.asarray(kind.ideal, nodes.dtype))
+
+
+def _sound(kind: ElementType, chunk: Chunk) -> Chunk:
+    return chunk._replace(local=_whole(kind, chunk.data.weight, chunk.local))
 
 
 def movable(admissible: Admissible) -> Bool[Array, " nodes"]:
@@ -271,5 +278,4 @@ def problem(
 
 def _cut(nodes: Array, size: Array, weight: Array, execution: Execution) -> Chunks:
     chunks = cut(nodes, Weighted(size, weight, jnp.zeros_like(size)), execution, _HEAVY)
-    ghosts = jnp.where(chunks.data.weight > 0, chunks.data.size, 1)
-    return eqx.tree_at(lambda c: c.data.size, chunks, ghosts)
+    return eqx.tree_at(lambda c: c.data.weight, chunks, jnp.where(chunks.real, chunks.data.weight, 0))
