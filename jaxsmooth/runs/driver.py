@@ -202,7 +202,9 @@ class _Driver:
                 elif done:
                     return Status.STALLED if still and place.row.shortened else Status.CONVERGED
             elif done or lost > _EXCURSION or index == steps or self._ended(settled, refusal):
-                if len(self.attempts) == 1 or self._ended(settled, refusal):
+                if self._ended(settled, refusal):
+                    return Status.CONVERGED
+                if len(self.attempts) == 1:
                     return Status.CONVERGED if settled else refusal
                 self.attempts, self.waiting, self.refused = self.attempts[1:], [], refusal
                 settled = lost = 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -19,8 +20,8 @@ from jaxsmooth.methods.elastic.method import Elastic
 from jaxsmooth.methods.optimize.distortion import METRICS
 from jaxsmooth.methods.optimize.goals import BALANCED, GOALS, UNTANGLE, Goal
 from jaxsmooth.methods.optimize.minimise import Minimiser, Newton
-from jaxsmooth.methods.optimize.problem import Aggregation, Problem, problem
-from jaxsmooth.metrics.evaluation import Evaluation, evaluate
+from jaxsmooth.methods.optimize.problem import Aggregation, Problem, Scalar, problem
+from jaxsmooth.metrics.evaluation import Evaluation
 from jaxsmooth.metrics.summary import POOR
 from jaxsmooth.motion.base import Motion
 from jaxsmooth.numerics.small import Frame
@@ -31,6 +32,15 @@ __all__ = ["Optimize"]
 _VALID = PatchGuard(gamma=0.0, poor=0.0, corner=0.0)  # only against inversion
 _PATIENCE = 4  # untangling stages without success
 _SLACK = 1.0002  # a rise of the largest e that needs no repair
+
+
+class _Start(NamedTuple):
+    """The mesh where the minimisation starts, its evaluation, and its largest e."""
+
+    mesh: Mesh
+    motion: Motion
+    evaluation: Evaluation
+    worst: Float[Array, ""]
 
 
 class _State(NamedTuple):
@@ -102,66 +112,77 @@ class Optimize(Method):
         mesh, motion = jax.lax.stop_gradient((mesh, motion))
         frame = Frame.of(mesh.points)
         mesh, motion = mesh.with_points(frame.into(mesh.points)), motion.within(frame)
-        sizes = (self.target if self.target.sized else OwnSize()).measures(mesh, frame)  # as units, if free
+        sizes = (self.target if self.target.sized else OwnSize()).measures(mesh, frame)  # units, if free
+        weight = self.target.weight if self.target.sized else 0.0
+        task = problem(mesh, motion, sizes, Aggregation(0.0, 0.0, 1.0), self.metric, weight)
+        start = self._start(task, mesh, motion, before, state)
+        hopeless = task.hopeless(mesh.points)
+        tangled = task.inverted(start.mesh.points, hopeless)
+        end = self._stages(task, start, hopeless, tangled)
+        finite = jnp.isfinite(end.points).all()
+        move = jnp.where(finite, end.points - mesh.points, 0)
+        return Proposal(move / frame.scale, end.iterations, jnp.zeros((), mesh.points.dtype))
+
+    def _start(self, task: Problem, mesh: Mesh, motion: Motion, before: Evaluation, state: Any) -> _Start:
+        """Where the minimisation starts: the start is for meshes that it helps, an optimised one goes on."""
+        begun, evaluation = self._begin(mesh, motion, before, state)
+        looks = jax.lax.map(partial(_look, task), jnp.stack([mesh.points, begun]))
+        stage = self.goal.last
+        judge = Aggregation(stage.average, stage.worst, stage.power, self._pivot(looks.ordered[0]))
+        here, there = (looks.weight * judge(looks.e)).sum(axis=1)
+        helped = (there < here) | (task.least(mesh.points) <= 0)
+        points, evaluation = jax.tree.map(
+            lambda a, b: jnp.where(helped, a, b), (begun, evaluation), (mesh.points, before)
+        )
+        worst = jnp.where(helped, looks.ordered[1, -1], looks.ordered[0, -1])
+        return _Start(mesh.with_points(points), motion, evaluation, worst)
+
+    def _stages(self, task: Problem, start: _Start, hopeless: Any, tangled: Scalar) -> _State:
+        """One minimisation after another; one copy of each function in the compiled program."""
         stages = (UNTANGLE,) * self.untangling_stages + self.goal.stages
         stages = jax.tree.map(lambda *values: jnp.stack([jnp.asarray(v) for v in values]), *stages)
-        zero = jnp.zeros((), mesh.points.dtype)
 
-        def task_of(stage, points):
-            aggregation = Aggregation(*(jnp.asarray(value, points.dtype) for value in stage[:3]))
-            task = self._problem(mesh, motion, sizes, aggregation)
-            return eqx.tree_at(lambda t: t.aggregation.pivot, task, self._pivot(task, points))
-
-        judge = task_of(self.goal.last, mesh.points)
-        hopeless = judge.hopeless(mesh.points)
-        # the start is for meshes that it helps: an optimised one goes on where it is
-        value, least = judge.value(mesh.points, zero)
-        begun = self._begin(mesh, motion, before, state)
-        helped = (judge.value(begun, zero)[0] < value) | (least <= 0)
-        start = mesh.with_points(jnp.where(helped, begun, mesh.points))
-        worst = _ordered(judge, start.points)[-1]
-
-        def minimise(state, stage):
+        def minimise(state, stage, ordered):
+            points, dtype = state.points, state.points.dtype
+            pivot = jnp.where(stage.repairing, start.worst, self._pivot(ordered))
+            numbers = [jnp.asarray(value, dtype) for value in (*stage[:3], pivot)]
             give_up = tuple(out | ~stage.untangling for out in hopeless)
-            task = task_of(stage, state.points)
-            pivot = jnp.where(stage.repairing, worst, task.aggregation.pivot)
-            task = eqx.tree_at(lambda t: t.aggregation.pivot, task, pivot).giving_up(state.points, give_up)
-            found = self.minimiser(task, state.points)
+            here = eqx.tree_at(lambda t: t.aggregation, task, Aggregation(*numbers))
+            found = self.minimiser(here.giving_up(points, give_up), points)
             inverted = task.inverted(found.points, hopeless)
             waited = jnp.where(inverted < state.fewest, 0, state.waited + 1)
             iterations = state.iterations + found.iterations
             return _State(found.points, iterations, jnp.minimum(inverted, state.fewest), waited)
 
-        def guarded(points):
-            return _VALID(start, motion, points - start.points, evaluate(start)).points
+        def go(state, stage):
+            ordered = _look(task, state.points).ordered
+            sound = stage.repairing & ((tangled > 0) | (ordered[-1] <= _SLACK * start.worst))
+            return jax.lax.cond(sound, lambda state, *_: state, minimise, state, stage, ordered)
 
-        def sound(points):
-            return (tangled > 0) | (_ordered(judge, points)[-1] <= _SLACK * worst)
+        def guarded(points):
+            return _VALID(start.mesh, start.motion, points - start.mesh.points, start.evaluation).points
 
         def run(state, numbered):
             index, stage = numbered
             idle = stage.untangling & ((state.fewest == 0) | (state.waited > _PATIENCE))
-            idle |= jax.lax.cond(stage.repairing, sound, lambda _: jnp.bool_(False), state.points)
-            state = jax.lax.cond(idle, lambda state, _: state, minimise, state, stage)
+            state = jax.lax.cond(idle, lambda state, _: state, go, state, stage)
             untangled = (index == self.untangling_stages - 1) & (tangled > 0)
             points = jax.lax.cond(untangled, guarded, lambda points: points, state.points)
             return state._replace(points=points), None
 
-        tangled = judge.inverted(start.points, hopeless)
-        first = _State(start.points, jnp.int32(0), tangled, jnp.int32(0))
-        end, _ = jax.lax.scan(run, first, (jnp.arange(len(stages.power)), stages))
-        finite = jnp.isfinite(end.points).all()
-        move = jnp.where(finite, end.points - mesh.points, 0)
-        return Proposal(move / frame.scale, end.iterations, zero)
+        first = _State(start.mesh.points, jnp.int32(0), tangled, jnp.int32(0))
+        return jax.lax.scan(run, first, (jnp.arange(len(stages.power)), stages))[0]
 
     def init(self, mesh: Mesh) -> Any:
         """The state of the starting method."""
         return None if self.start is None else self.start.init(mesh)
 
-    def _begin(self, mesh: Mesh, motion: Motion, before: Evaluation, state: Any) -> Float[Array, "nodes dim"]:
-        """The points after the steps of the starting method."""
+    def _begin(
+        self, mesh: Mesh, motion: Motion, before: Evaluation, state: Any
+    ) -> tuple[Float[Array, "nodes dim"], Evaluation]:
+        """The points after the steps of the starting method, and their evaluation."""
         if self.start is None:
-            return mesh.points
+            return mesh.points, before
 
         def unfinished(carry):
             _, before, count = carry
@@ -173,20 +194,24 @@ class Optimize(Method):
             found = self.start.step(mesh.with_points(points), motion, before, state)
             return found.points, found.evaluation, count + 1
 
-        return jax.lax.while_loop(unfinished, step, (mesh.points, before, jnp.int32(0)))[0]
+        return jax.lax.while_loop(unfinished, step, (mesh.points, before, jnp.int32(0)))[:2]
 
-    def _problem(self, mesh: Mesh, motion: Motion, sizes, aggregation: Aggregation) -> Problem:
-        weight = self.target.weight if self.target.sized else 0.0
-        return problem(mesh, motion, sizes, aggregation, self.metric, weight)
-
-    def _pivot(self, task: Problem, points: Float[Array, "nodes dim"]) -> Float[Array, ""]:
+    def _pivot(self, ordered: Float[Array, " elements"]) -> Float[Array, ""]:
         """The e that so many of the elements with weight exceed."""
-        e = _ordered(task, points)
-        behind = jnp.floor(self.pivot * jnp.sqrt((e > 0).sum())).astype(jnp.int32)
-        return jnp.maximum(e[jnp.maximum(len(e) - 1 - behind, 0)], 1)  # 1 where nothing may move
+        behind = jnp.floor(self.pivot * jnp.sqrt((ordered > 0).sum())).astype(jnp.int32)
+        # 1 where nothing may move
+        return jnp.maximum(ordered[jnp.maximum(len(ordered) - 1 - behind, 0)], 1)
 
 
-def _ordered(task: Problem, points: Float[Array, "nodes dim"]) -> Float[Array, " elements"]:
-    """The finite e of the elements with weight in ascending order, after zeros for the others."""
+class _Look(NamedTuple):
+    """e of all elements, their weights, and the finite e of those with weight in order, after zeros."""
+
+    e: Float[Array, " elements"]
+    weight: Float[Array, " elements"]
+    ordered: Float[Array, " elements"]
+
+
+def _look(task: Problem, points: Float[Array, "nodes dim"]) -> _Look:
     e, weight = task.inverse_quality(points)
-    return jnp.sort(jnp.where((weight > 0) & jnp.isfinite(e), jnp.maximum(e, 1), 0))
+    ordered = jnp.sort(jnp.where((weight > 0) & jnp.isfinite(e), jnp.maximum(e, 1), 0))
+    return _Look(e, weight, ordered)

@@ -96,8 +96,9 @@ class Newton(Minimiser):
                 length = length / 2
                 return length, *problem.value(place(length), eps), halvings + 1
 
-            first = (jnp.ones((), points.dtype), *problem.value(place(1), eps), jnp.int32(0))
-            length, after, least, halvings = jax.lax.while_loop(rejected, halve, first)
+            length, after, least, halvings = jax.lax.while_loop(
+                rejected, halve, (2.0 * one, jnp.inf * one, -one, jnp.int32(-1))
+            )
             accepted = (halvings < _HALVINGS) & jnp.isfinite(after)
             points = jnp.where(accepted, place(length), points)
             after, least = jnp.where(accepted, after, value), jnp.where(accepted, least, worst)
@@ -105,10 +106,9 @@ class Newton(Minimiser):
             done = ~accepted | ((value - after <= self.tolerance * jnp.abs(value)) & (least > 0))
             return points, least, after, count + 1, done
 
-        value, worst = problem.value(points, jnp.zeros((), points.dtype))
-        points, _, value, count, _ = jax.lax.while_loop(
-            unfinished, step, (points, worst, value, jnp.int32(0), jnp.bool_(False))
-        )
+        one = jnp.ones((), points.dtype)
+        start = (points, problem.least(points), jnp.inf * one, jnp.int32(0), jnp.bool_(False))
+        points, _, value, count, _ = jax.lax.while_loop(unfinished, step, start)
         return Minimised(points, value, count)
 
 
@@ -117,8 +117,7 @@ class Newton(Minimiser):
 
 def _reduced(problem: Problem, points: Field):
     """The objective of y, with points + T (s y); s makes the Hessian's diagonal blocks about 1."""
-    zero = jnp.zeros((), points.dtype)
-    worst = problem.value(points, zero)[1]
+    worst = problem.least(points)
     eps = regularisation(worst)
     here = problem.motion.at(points)
     inverse = block_inverse(problem.model(points, eps)[1], here)

@@ -56,11 +56,11 @@ class Aggregation(eqx.Module):
     power: Scalar | float
     pivot: Scalar | float = 1.0
 
-    def __call__(self, e: Scalar) -> Scalar:
+    def __call__(self, e: Float[Array, "..."]) -> Float[Array, "..."]:
         """φ(e)."""
         return self.average * (1 - 1 / e) + self.worst / self.power * (e / self.pivot) ** self.power
 
-    def derivatives(self, e: Scalar) -> tuple[Scalar, Scalar]:
+    def derivatives(self, e: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """φ′ and φ″."""
         rise = self.worst / self.pivot * (e / self.pivot) ** (self.power - 1)
         return self.average / e**2 + rise, -2 * self.average / e**3 + (self.power - 1) / e * rise
@@ -124,6 +124,16 @@ class Problem(eqx.Module):
             return jnp.where(block.data.weight > 0, det, jnp.inf)
 
         return tuple(found(kind, block) for kind, block in zip(self.kinds, self.blocks, strict=True))
+
+    def least(self, points: Field) -> Scalar:
+        """The least of all determinants, but for those of elements that are given up."""
+        dets = self.determinants(points)
+        return jnp.stack(
+            [
+                jnp.where(block.data.relief == 0, det, jnp.inf).min()
+                for det, block in zip(dets, self.blocks, strict=True)
+            ]
+        ).min()
 
     def hopeless(self, points: Field) -> tuple[Bool[Array, "chunks size"], ...]:
         """The elements that stay inverted: a determinant is not positive and all its nodes are held."""
