@@ -114,7 +114,7 @@ def test_invariance_to_similarity(name):
 def test_hessian_model_is_positive_and_its_diagonal_right(name):
     kind = element_type(name)
     aggregation = Aggregation(1.0, 1.0, 6.0, 1.2)
-    model = hessian_model(
+    *_, model = hessian_model(
         kind, "shape", 0.5, aggregation.derivatives, jiggled(kind), jnp.float64(1.0), jnp.float64(0.0)
     )
     units = jnp.eye(kind.k * kind.dim).reshape(-1, kind.k, kind.dim)
@@ -131,7 +131,7 @@ def test_hessian_model_of_the_mean_ratio_is_exact_where_nothing_is_left_out(name
     """Along displacements that leave the determinant's second derivative out: one node's."""
     kind = element_type(name)
     nodes = jiggled(kind, 0.1)
-    model = hessian_model(
+    *_, model = hessian_model(
         kind, "mean_ratio", 0.0, lambda e: (jnp.ones_like(e), jnp.zeros_like(e)), nodes, 1.0, 0.0
     )
     direction = jnp.zeros_like(nodes).at[0].set(jnp.asarray(RNG(4).standard_normal(kind.dim)))

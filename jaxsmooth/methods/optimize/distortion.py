@@ -254,13 +254,14 @@ class Model(NamedTuple):
     """Hessian model of one element: a sum of squares.
 
     Attributes:
-        facets: ``[s, dim−1, dim−1]``: metric tensors of the facets, times what they weigh.
+        surface: ``[k, k]``, the same for each direction in space: ``Σ Gᵀ M G`` over the sample points of all
+            facets, with their metric tensors M times what they weigh, and their natural derivatives G.
         samples: see `Samples`.
         vectors: nodal fields ``[m, k, dim]`` whose products with a displacement are squared:
             the gradients of e, of the size, and of the isoperimetric ratio.
     """
 
-    facets: Array | None
+    surface: Float[Array, "k k"] | None
     samples: Samples | None
     vectors: Float[Array, "m k dim"]
 
@@ -273,7 +274,7 @@ def hessian_model(
     nodes: Nodes,
     size: Scalar,
     eps: Scalar,
-) -> Model:
+) -> tuple[Scalar, Nodes, Model]:
     """Positive semi-definite model of the Hessian of φ(e) of one element.
 
     Left out: the second derivative of the determinant, and φ″ where negative.  Surfaces enter by
@@ -288,7 +289,7 @@ def hessian_model(
         jnp.sqrt(first * _size_weight(size_weight, eps, volume.value / size) * size / volume.value**3)
         * volume.gradient,
     ]
-    facets = None
+    pull = None
     if surface is not None:
         # S^d / V^(d−1) has second differential ∝ (dS − S/V dV)² where S and V are linear
         ratio = (surface.value / kind.ideal_surface) ** 2 / volume.value ** (2 * (dim - 1) / dim)
@@ -300,11 +301,14 @@ def hessian_model(
             slope = surface.gradient / surface.value - (dim - 1) / dim * volume.gradient / volume.value
             vectors.append(jnp.sqrt(first * bend) * 2 * ratio * slope)
         vectors.append(jnp.sqrt(weight * 2 * (dim - 1) * ratio) * change)
-        facets = weight * 2 * ratio / surface.value * surface.pull
+        tangents = jnp.asarray(kind.facet_tangents, nodes.dtype)
+        turned = (tangents[:, :, :, None] * surface.pull[:, None]).sum(axis=2)
+        pull = (turned[:, :, None] * tangents[:, None]).sum(axis=(0, -1))
+        pull = weight * 2 * ratio / surface.value * pull
     if samples is not None:
         weight = first * (_SKEW if isoperimetric(kind, metric) else 1)
         samples = samples._replace(factors=weight * samples.factors)
-    return Model(facets, samples, jnp.stack(vectors))
+    return found.value, found.gradient, Model(pull, samples, jnp.stack(vectors))
 
 
 def _to_nodes(gradients: Float[Array, "q k j"], stress: Float[Array, "q dim j"]) -> Nodes:
@@ -314,11 +318,8 @@ def _to_nodes(gradients: Float[Array, "q k j"], stress: Float[Array, "q dim j"])
 def apply_model(kind: ElementType, move: Nodes, model: Model) -> Nodes:
     """The model times a displacement ``[k, dim]``."""
     force = ((model.vectors * move).sum(axis=(-1, -2))[:, None, None] * model.vectors).sum(axis=0)
-    if model.facets is not None:
-        tangents = jnp.asarray(kind.facet_tangents, move.dtype)
-        change = contract(move, tangents)
-        stress = (change[:, :, :, None] * model.facets[:, None, :, :]).sum(axis=2)
-        force = force + _to_nodes(tangents, stress)
+    if model.surface is not None:
+        force = force + (model.surface[:, :, None] * move).sum(axis=1)
     if model.samples is not None:
         frames, cof, factors, inverse = model.samples
         points = jnp.asarray(_points(kind), move.dtype)
@@ -335,10 +336,8 @@ def model_diagonal(kind: ElementType, model: Model) -> Float[Array, "k dim dim"]
     """Diagonal node blocks of the model."""
     eye = jnp.eye(kind.dim, dtype=model.vectors.dtype)
     blocks = _outer(model.vectors, model.vectors).sum(axis=0)
-    if model.facets is not None:
-        tangents = jnp.asarray(kind.facet_tangents, eye.dtype)
-        turned = (tangents[:, :, :, None] * model.facets[:, None, :, :]).sum(axis=2)
-        blocks = blocks + (turned * tangents).sum(axis=(0, -1))[:, None, None] * eye
+    if model.surface is not None:
+        blocks = blocks + jnp.diagonal(model.surface)[:, None, None] * eye
     if model.samples is not None:
         frames, cof, factors, inverse = model.samples
         points = jnp.asarray(_points(kind), eye.dtype) * inverse[:, None, :]

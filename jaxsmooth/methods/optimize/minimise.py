@@ -69,9 +69,8 @@ class Newton(Minimiser):
             points, worst, _, count, _ = state
             eps = regularisation(worst)
             here = problem.motion.at(points)
-            value, gradient = problem.value_and_grad(points, eps)
+            value, gradient, models, blocks = problem.quadratic(points, eps)
             gradient = here.collect(gradient)
-            models, blocks = problem.model(points, eps)
             inverse = block_inverse(blocks, here)
             move = conjugate_gradients(
                 lambda w: here.collect(problem.apply(models, here.followed(w))),
@@ -120,7 +119,7 @@ def _reduced(problem: Problem, points: Field):
     worst = problem.least(points)
     eps = regularisation(worst)
     here = problem.motion.at(points)
-    inverse = block_inverse(problem.model(points, eps)[1], here)
+    inverse = block_inverse(problem.quadratic(points, eps).blocks, here)
     scale = jnp.sqrt(jnp.trace(inverse, axis1=-2, axis2=-1) / points.shape[-1])[:, None]
 
     def place(y):

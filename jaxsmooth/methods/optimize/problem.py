@@ -80,6 +80,22 @@ class Weighted(NamedTuple):
     relief: Array
 
 
+class Quadratic(NamedTuple):
+    """A quadratic model of the objective.
+
+    Attributes:
+        value: the objective.
+        gradient: with respect to all points ``[nodes, dim]``.
+        models: the Hessian model of all elements; `Problem.apply` multiplies with it.
+        blocks: its node blocks ``[nodes, dim, dim]``.
+    """
+
+    value: Float[Array, ""]
+    gradient: Field
+    models: tuple[Chunks, ...]
+    blocks: Float[Array, "nodes dim dim"]
+
+
 class Problem(eqx.Module):
     """The objective of a mesh as a function of its points, within its constraints.
 
@@ -201,10 +217,11 @@ class Problem(eqx.Module):
         start = (jnp.zeros((), points.dtype), jnp.zeros_like(points))
         return self._scan(add, start, points)
 
-    def model(self, points: Field, eps: Scalar) -> tuple[tuple[Chunks, ...], Float[Array, "nodes dim dim"]]:
-        """The Hessian model of all elements, and its node blocks."""
-        models = []
-        total = jnp.zeros((*points.shape, points.shape[-1]), points.dtype)
+    def quadratic(self, points: Field, eps: Scalar) -> Quadratic:
+        """The objective, its gradient and its Hessian model."""
+        dim, models = points.shape[-1], []
+        value, zero = jnp.zeros((), points.dtype), jnp.zeros_like(points)
+        state = value, zero, jnp.zeros((*points.shape, dim), points.dtype)
         for kind, block in zip(self.kinds, self.blocks, strict=True):
 
             def element(nodes, data, kind=kind):
@@ -214,16 +231,21 @@ class Problem(eqx.Module):
 
                 eps_here = jnp.maximum(eps, data.relief)
                 args = (kind, self.metric, self.size_weight, aggregate)
-                model = hessian_model(*args, nodes, data.size, eps_here)
-                return model, model_diagonal(kind, model)
+                e, gradient, model = hessian_model(*args, nodes, data.size, eps_here)
+                slope = aggregate(e)[0] * gradient
+                return data.weight * self.aggregation(e), slope, model, model_diagonal(kind, model)
 
-            def add(total, chunk, kind=kind, element=element):
-                model, diagonal = jax.vmap(element)(_sound(kind, chunk).local, chunk.data)
-                return chunk.add(total, diagonal), model
+            def add(state, chunk, kind=kind, element=element):
+                value, gradient, blocks = state
+                sound = _sound(kind, chunk)
+                energy, slope, model, diagonal = jax.vmap(element)(sound.local, chunk.data)
+                state = value + energy.sum(), chunk.add(gradient, slope), chunk.add(blocks, diagonal)
+                return state, model
 
-            total, model = scan(add, total, block, points)
+            state, model = scan(add, state, block, points)
             models.append(Chunks(block.nodes, model, block.count))
-        return tuple(models), total
+        value, gradient, blocks = state
+        return Quadratic(value, gradient, tuple(models), blocks)
 
     def apply(self, models: tuple[Chunks, ...], move: Field) -> Field:
         """The Hessian model times a displacement."""
