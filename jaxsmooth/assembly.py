@@ -12,7 +12,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxsmooth.mesh.execution import Execution
 from jaxsmooth.mesh.record import Mesh
@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 
-def gather(values: Float[Array, "nodes ..."], nodes: Int[Array, ...]) -> Float[Array, ...]:
+def gather(values: Shaped[Array, "nodes ..."], nodes: Int[Array, ...]) -> Shaped[Array, ...]:
     """Values at the nodes of elements.  Indices were checked when the mesh was built."""
     return values.at[nodes].get(mode="promise_in_bounds")
 
