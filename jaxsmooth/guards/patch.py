@@ -129,7 +129,7 @@ class PatchGuard(Guard):
 
 
 def _floor(
-    floor: Array | float, keep: Array | float, values: Blocks
+    floor: Array | float, keep: Array | float, values: tuple[Float[Array, " _"] | None, ...]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """`floor`, or a part of the least of all values where that is more, and that least; −∞ for no floor."""
     parts = [part.min() for part in values if part is not None]
