@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -31,7 +32,7 @@ class NodeLinks(eqx.Module):
     rotations: Float[np.ndarray, "links dim dim"]
 
     @classmethod
-    def pairs(cls, pairs: np.ndarray, rotation: np.ndarray) -> NodeLinks:
+    def pairs(cls, pairs: Any, rotation: Any) -> NodeLinks:
         """The first node of every pair ``[m, 2]`` does what the second does, turned by R ``[dim, dim]``."""
         pairs = np.asarray(pairs).astype(np.int64).reshape(-1, 2)
         turned = np.tile(np.asarray(rotation, np.float64), (len(pairs), 1, 1))

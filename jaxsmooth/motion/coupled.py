@@ -150,9 +150,10 @@ def _resolve(links: NodeLinks, count: int) -> tuple[_Groups, _Hanging]:
         if not wrong.any():
             return groups, hanging
         own = groups.of[rest.nodes]
-        groups.barred[own[wrong]] += np.eye(links.rotations.shape[-1])
-        groups.barred[groups.of[rest.parents[wrong]]] += np.eye(links.rotations.shape[-1])
-        rest = rest.select(~np.isin(own, own[wrong]))
+        gone = np.isin(own, own[wrong])
+        groups.barred[own[gone]] += np.eye(links.rotations.shape[-1])
+        groups.barred[groups.of[rest.parents[gone]]] += np.eye(links.rotations.shape[-1])
+        rest = rest.select(~gone)
 
 
 def _grouped(links: NodeLinks, count: int) -> _Groups:

@@ -139,6 +139,17 @@ class Admissible(eqx.Module):
         values = values.at[links.parents].min(values[links.dependent][:, None])
         return values.at[links.dependent].set(values[links.parents].min(axis=1))
 
+    def least_of_equals(self, values: Array) -> Array:
+        """The same among nodes that do all that the other does; those that hang get their parents' least."""
+        if self.links is None:
+            return values
+        links = self.links
+        equal = links.rigid[:, None] > 0
+        values = values.at[links.parents].min(
+            jnp.where(equal, values[links.dependent][:, None], values[links.parents])
+        )
+        return values.at[links.dependent].set(values[links.parents].min(axis=1))
+
     def together(self, mask: Array) -> Array:
         """Nodes of a mask ``[nodes]``, and those that they lead or follow."""
         return ~self.least(~mask)

@@ -216,7 +216,11 @@ class Problem(eqx.Module):
         """The Hessian model times a displacement."""
         total = jnp.zeros_like(move)
         for kind, model in zip(self.kinds, models, strict=True):
-            total = sum_to_nodes(partial(apply_model, kind), model, move, total)
+
+            def product(model, move, kind=kind):
+                return apply_model(kind, move, model)
+
+            total = sum_to_nodes(product, model, move, total)
         return total
 
 
