@@ -208,6 +208,29 @@ def test_the_rotation_of_a_sector(given):
     assert corner in links.nodes[links.nodes == links.parents[:, 0]]  # it is linked to itself
 
 
+def test_the_map_of_a_plane_mesh_in_space():
+    """The affine map is one of space; the links are between coordinates in the plane."""
+    points, blocks = meshes.grid("triangle", (3, 3))
+    turn, shift = meshes.rotation_matrix(3, seed=3), np.array([3.0, 1, -2])
+    quarter = turn @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ turn.T
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = quarter, shift - quarter @ shift
+    low, left = (np.flatnonzero(points[:, k] == 0) for k in (1, 0))
+    low, left = low[np.argsort(points[low, 0])], left[np.argsort(points[left, 1])]
+    space = np.c_[points, np.zeros(len(points))] @ turn.T + shift
+    pairs = np.c_[left, low]
+    np.testing.assert_allclose(space[left], space[low] @ quarter.T + affine[:3, 3], atol=1e-12)
+    links = [[0, (1, 2), affine.ravel(), pairs[-1:]]]  # one pair says nothing of the rotation by itself
+    file = js.from_meshio(meshio.Mesh(space, blocks, gmsh_periodic=links))
+    assert file.plane is not None
+    found = file.mesh.labels.links.rotations[0]
+    flat = np.asarray(file.mesh.points)
+    corner = np.flatnonzero((points == 0).all(axis=1))[0]
+    np.testing.assert_allclose(
+        flat[left] - flat[corner], (flat[low] - flat[corner]) @ found.T, rtol=0, atol=1e-12
+    )
+
+
 # --- Hanging nodes -----------------------------------------------------------------------
 
 
