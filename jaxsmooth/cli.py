@@ -154,7 +154,7 @@ def _add_run_options(command: argparse.ArgumentParser) -> None:
     help = (
         "move the nodes of opposite faces together, along axes such as xy (default: as the file links them)"
     )
-    add("--periodic", default="", metavar="AXES", help=help)
+    add("--periodic", default=None, metavar="AXES", help=help)
     help = "write history and timings, - for standard output (default: none)"
     add("--json", metavar="FILE", help=help)
     help = "print only errors, what OUT can't hold, and what stays inverted (default: progress and a table)"

@@ -300,6 +300,15 @@ def test_links_of_another_mesh_are_refused():
         mesh_of("quad", (1, 1)).with_links(mesh.labels.links)
 
 
+def test_links_are_given_all_at_once():
+    mesh = periodic_square()
+    coupled = js.detect_constraints(mesh)
+    with pytest.raises(ValueError, match="can't be coupled again; give it all links at once"):
+        js.couple(coupled, mesh)
+    with pytest.raises(ValueError, match="give all links to one of them"):
+        (coupled & coupled).at(mesh.points)
+
+
 # --- Two motions ---------------------------------------------------------------------------
 
 

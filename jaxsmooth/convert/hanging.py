@@ -112,18 +112,11 @@ def find_hanging(points: np.ndarray, blocks: Blocks, boundary: Sequence[Facets])
         if part.type.dim == 2:
             faces = part.nodes[rows.reshape(-1, len(part.nodes)).any(axis=0)]
             found.append(search.inside(part.type, faces, blocks))
-        links += [
-            NodeLinks.hanging(nodes, facets, weights, points.shape[1]) for facets, nodes, weights in found
-        ]
-    return _distinct(NodeLinks.join(links))
-
-
-def _distinct(links: NodeLinks | None) -> NodeLinks | None:
-    """Each once: the elements around an edge all list it."""
-    if links is None:
-        return None
-    sets = np.sort(links.parents, axis=1)
-    return links.select(np.unique(np.column_stack([links.nodes, sets]), axis=0, return_index=True)[1])
+        for facets, nodes, weights in found:
+            rows = np.column_stack([nodes, np.sort(facets, axis=1)])
+            once = np.unique(rows, axis=0, return_index=True)[1]  # all elements around an edge list it
+            links.append(NodeLinks.hanging(nodes[once], facets[once], weights[once], points.shape[1]))
+    return NodeLinks.join(links)
 
 
 def _edges_of(kind: ElementType, facets: np.ndarray) -> tuple[ElementType, np.ndarray]:

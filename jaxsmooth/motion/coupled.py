@@ -86,12 +86,15 @@ def couple(motion: Motion, mesh: Mesh, links: NodeLinks | None = None) -> Motion
 
     Returns:
         `Coupled`, or, where no node has to follow another, `motion` with more nodes held.
+
+    Raises:
+        ValueError: for a motion that has dependent nodes already.
     """
     if links is None and mesh.labels is not None:
         links = mesh.labels.links
     if links is None or len(links.nodes) == 0:
         return motion
-    tangents = np.array(motion.at(mesh.points).projectors, np.float64)
+    tangents = np.array(_uncoupled(motion.at(mesh.points)).projectors, np.float64)
     groups, hanging = _resolve(links, len(mesh.points))
     bound, projectors, still = _limits(groups, hanging, tangents)
     dtype = mesh.points.dtype
@@ -104,6 +107,12 @@ def couple(motion: Motion, mesh: Mesh, links: NodeLinks | None = None) -> Motion
         motion = motion & Constraints(jnp.asarray(limits, dtype))
     following = _links(groups, hanging, still, dtype)
     return Coupled(motion, following) if len(following.dependent) else motion
+
+
+def _uncoupled(tangents: Admissible) -> Admissible:
+    if tangents.links is not None:
+        raise ValueError("a motion with dependent nodes can't be coupled again; give it all links at once")
+    return tangents
 
 
 class _Groups(NamedTuple):
