@@ -22,11 +22,11 @@ _PLANES = 100  # faces of more planes than this are curved
 
 def find_periodic(
     mesh: Any,
-    along: str | Sequence[Sequence[float]] = "",
+    along: Any = "",
     *,
     angle: float | None = None,
-    axis: str | Sequence[float] = "z",
-    origin: Sequence[float] | None = None,
+    axis: Any = "z",
+    origin: Any = None,
     tolerance: float | None = None,
 ) -> NodeLinks:
     """Find boundary nodes that a translation or a rotation takes to others, facet by facet.
@@ -75,7 +75,7 @@ def find_periodic(
 
 
 def _maps(
-    points: np.ndarray, along: str | Sequence[Sequence[float]], angle: float | None, axis
+    points: np.ndarray, along: Any, angle: float | None, axis: Any
 ) -> Iterator[tuple[np.ndarray, np.ndarray, str]]:
     """Rotation, translation and their name for all that is asked for."""
     dim = points.shape[1]

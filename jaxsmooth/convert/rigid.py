@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ _RIGID = 1e-6  # of the size of a mesh, by which linked nodes may miss the place
 _SNAP = 1e-12  # entries of a rotation so near to 0 or ±1 are meant to be that
 
 
-def rotation_about(axis: str | Sequence[float], degrees: float, dim: int) -> np.ndarray:
+def rotation_about(axis: Any, degrees: float, dim: int) -> np.ndarray:
     """The rotation matrix ``[dim, dim]`` (Rodrigues' formula); in the plane it needs no axis."""
     if not np.isfinite(degrees) or degrees % 360 == 0:
         raise ValueError(f"the angle must be a number of degrees, no multiple of 360, got {degrees}")
