@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 
-def gather(values: Shaped[Array, "nodes ..."], nodes: Int[Array, ...]) -> Shaped[Array, ...]:
+def gather(values: Shaped[Array, "nodes ..."], nodes: Int[Array, "..."]) -> Shaped[Array, "..."]:
     """Values at the nodes of elements.  Indices were checked when the mesh was built."""
     return values.at[nodes].get(mode="promise_in_bounds")
 

@@ -22,6 +22,7 @@ from jaxsmooth.numerics.small import Frame
 __all__ = ["PatchGuard"]
 
 Blocks = tuple[Float[Array, " _"], ...]
+Corners = tuple[Float[Array, " _"] | None, ...]
 Field = Float[Array, "nodes dim"]
 
 
@@ -36,7 +37,7 @@ class _Needs(NamedTuple):
     node: tuple[Float[Array, "_ _"], ...]
     quality: Blocks
     jacobian: Blocks
-    corners: tuple[Float[Array, " _"] | None, ...]
+    corners: Corners
 
 
 class PatchGuard(Guard):
@@ -129,7 +130,7 @@ class PatchGuard(Guard):
 
 
 def _floor(
-    floor: Array | float, keep: Array | float, values: tuple[Float[Array, " _"] | None, ...]
+    floor: Array | float, keep: Array | float, values: Corners
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """`floor`, or a part of the least of all values where that is more, and that least; −∞ for no floor."""
     parts = [part.min() for part in values if part is not None]

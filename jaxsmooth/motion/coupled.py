@@ -48,19 +48,15 @@ class Coupled(Motion):
 
     @property
     def freedom(self) -> np.ndarray:
-        """Free directions of every node ``[nodes]``, where `base` is `Constraints`, the same everywhere."""
-        return self._following(Admissible(self.base.projectors)).freedom
+        """Free directions of every node ``[nodes]``, where `base` has them as `Constraints` do."""
+        free = self.base.freedom.copy()
+        free[np.asarray(self.links.dependent)] = free[np.asarray(self.links.parents)].max(axis=1)
+        return free
 
     def at(self, points: Field) -> Admissible:
         """The tangents of the leading nodes, and the links."""
-        return self._following(self.base.at(points))
-
-    def _following(self, tangents: Admissible) -> Admissible:
-        if tangents.links is not None:
-            raise ValueError(
-                "a motion with dependent nodes can't be coupled again; give it all links at once"
-            )
-        return Admissible(tangents.projectors.at[self.links.dependent].set(0), self.links)
+        projectors = _uncoupled(self.base.at(points)).projectors
+        return Admissible(projectors.at[self.links.dependent].set(0), self.links)
 
     def retract(self, points: Field, move: Field) -> Field:
         """The leading nodes go first; ``x + R Σ weight · (new − old)`` is where the others end."""
