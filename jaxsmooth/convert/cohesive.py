@@ -53,7 +53,7 @@ def without_thickness(points: np.ndarray, blocks: Blocks) -> tuple[list[np.ndarr
         found = kept
     pairs = [np.zeros((0, 2), np.int64)]
     for (kind, nodes), axis in zip(blocks, found, strict=True):
-        for d in _axes(kind):
+        for d in range(kind.dim):
             pairs += [nodes[axis == d][:, ends] for ends in _through(kind, d)]
     return [axis >= 0 for axis in found], np.unique(np.concatenate(pairs), axis=0)
 
