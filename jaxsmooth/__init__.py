@@ -17,11 +17,13 @@ __version__ = "0.1.0"
 _HOMES = {
     "cells.table": ("element_type",),
     "convert.meshfile": ("MeshFile", "as_mesh", "from_meshio"),
+    "convert.periodic": ("find_periodic",),
     "files.io": ("read", "write"),
     "guards.acceptance": ("AcceptanceRule", "Status"),
     "guards.base": ("Guard",),
     "guards.patch": ("PatchGuard",),
     "mesh.layers": ("boundary_layers", "stretched"),
+    "mesh.links": ("NodeLinks",),
     "mesh.record": ("Labels", "Mesh"),
     "methods": ("METHODS", "Elastic", "Laplacian", "Method", "Optimize"),
     "methods.elastic.elasticity": ("Material",),
@@ -31,6 +33,7 @@ _HOMES = {
     "metrics.summary": ("Statistics", "statistics"),
     "metrics.table": ("METRICS", "quality", "quality_mean"),
     "motion.base": ("Motion",),
+    "motion.coupled": ("Coupled", "couple"),
     "motion.detect": ("detect_constraints",),
     "motion.planar": ("Constraints",),
     "runs.batch": ("Batch", "stack"),
@@ -44,11 +47,13 @@ __all__ = sorted(_HOME)
 if TYPE_CHECKING:
     from jaxsmooth.cells.table import element_type
     from jaxsmooth.convert.meshfile import MeshFile, as_mesh, from_meshio
+    from jaxsmooth.convert.periodic import find_periodic
     from jaxsmooth.files.io import read, write
     from jaxsmooth.guards.acceptance import AcceptanceRule, Status
     from jaxsmooth.guards.base import Guard
     from jaxsmooth.guards.patch import PatchGuard
     from jaxsmooth.mesh.layers import boundary_layers, stretched
+    from jaxsmooth.mesh.links import NodeLinks
     from jaxsmooth.mesh.record import Labels, Mesh
     from jaxsmooth.methods import METHODS, Elastic, Laplacian, Method, Optimize
     from jaxsmooth.methods.elastic.elasticity import Material
@@ -58,6 +63,7 @@ if TYPE_CHECKING:
     from jaxsmooth.metrics.summary import Statistics, statistics
     from jaxsmooth.metrics.table import METRICS, quality, quality_mean
     from jaxsmooth.motion.base import Motion
+    from jaxsmooth.motion.coupled import Coupled, couple
     from jaxsmooth.motion.detect import detect_constraints
     from jaxsmooth.motion.planar import Constraints
     from jaxsmooth.runs.batch import Batch, stack

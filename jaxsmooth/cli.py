@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from jaxsmooth.convert.meshfile import MeshFile
     from jaxsmooth.methods import Method
+    from jaxsmooth.motion.base import Motion
 
 __all__ = ["main"]
 
@@ -150,6 +151,10 @@ def _add_run_options(command: argparse.ArgumentParser) -> None:
     add("--freeze-aspect", type=float, default=None, metavar="A", help=help)
     help = "hold the nodes of a named set; repeatable (default: none but those that the file marks)"
     add("--fix", action="append", default=[], metavar="NAME", help=help)
+    help = (
+        "move the nodes of opposite faces together, along axes such as xy (default: as the file links them)"
+    )
+    add("--periodic", default=None, metavar="AXES", help=help)
     help = "write history and timings, - for standard output (default: none)"
     add("--json", metavar="FILE", help=help)
     help = "print only errors, what OUT can't hold, and what stays inverted (default: progress and a table)"
@@ -324,16 +329,17 @@ def _method(name: str, goal: str | None) -> Method:
     return Optimize(goal=goal)
 
 
-def _run(file: MeshFile, method: Method, steps: int | None, constraints: Constraints, callback: Any):
+def _run(file: MeshFile, method: Method, steps: int | None, constraints: Motion, callback: Any):
     from jaxsmooth.runs.driver import smooth
 
     exactly = {} if steps is None else {"steps": steps, "tolerance_avg": 0.0}
     return smooth(file.mesh, method, constraints=constraints, callback=callback, **exactly)
 
 
-def _constraints(file: MeshFile, options: argparse.Namespace) -> Constraints:
+def _constraints(file: MeshFile, options: argparse.Namespace) -> Motion:
     import difflib
 
+    from jaxsmooth.convert.periodic import find_periodic
     from jaxsmooth.motion.detect import detect_constraints
 
     fixed = file.fixed.copy()
@@ -347,8 +353,11 @@ def _constraints(file: MeshFile, options: argparse.Namespace) -> Constraints:
             raise ValueError(f"unknown set {name!r}; {hint}")
         fixed |= file.named_sets[name]
     frozen = {} if options.freeze_aspect is None else {"freeze_aspect": options.freeze_aspect}
+    mesh = file.mesh
+    if options.periodic:
+        mesh = mesh.with_links(find_periodic(mesh, options.periodic))
     return detect_constraints(
-        file.mesh,
+        mesh,
         boundary=options.boundary,
         interfaces=options.interfaces,
         feature_angle=options.feature_angle,

@@ -1,4 +1,4 @@
-"""Nodes that belong together stay together: found when a mesh is read, held, and said."""
+"""Nodes that belong together: found when a mesh is read, linked or held, and said."""
 
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import pytest
 import jaxsmooth as js
 from jaxsmooth.cells.table import element_type
 from jaxsmooth.convert.meshfile import MeshFileError, to_meshio
+from jaxsmooth.mesh.topology import find_facets
 
 CASES = Path(__file__).parents[2] / "shared" / "cases"
 
@@ -25,20 +26,26 @@ def held(file):
     return np.zeros(len(file.mesh.points), bool) if mask is None else mask
 
 
+def linked(file):
+    links = file.mesh.labels.links
+    return np.zeros(len(file.mesh.points), bool) if links is None else links.members(len(file.mesh.points))
+
+
 # --- Cohesive cells and contacts ---------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["13_cohesive_straight", "14_contact_straight", "14_contact_wavy"])
 def test_pairs_stay_together(name):
     file, pairs = case(f"{name}.vtu"), case(f"{name}_pairs.npz")["pairs"]
-    np.testing.assert_array_equal(np.flatnonzero(held(file)), np.unique(pairs))
+    np.testing.assert_array_equal(np.flatnonzero(linked(file)), np.unique(pairs))
+    assert not held(file).any()
     result = js.smooth(file, steps=3)
     points = np.asarray(result.mesh.points)
     assert not np.array_equal(points, np.asarray(file.mesh.points))
     np.testing.assert_array_equal(points[pairs[:, 0]], points[pairs[:, 1]])
     assert result.history[-1].statistics.inverted == 0
     assert len(file.notes) == 1
-    assert ("no thickness" if "cohesive" in name else "parts in contact") in file.notes[0]
+    assert ("move in pairs" if "cohesive" in name else "(parts in contact); they move tog") in file.notes[0]
 
 
 def test_cohesive_cells_are_written_as_they_were():
@@ -80,7 +87,10 @@ def test_elements_without_thickness_in_every_direction(name):
         file = js.from_meshio(meshio.Mesh(points, [(name, cells)]))
         np.testing.assert_array_equal(file.mesh.connectivity[0], cells[:2])
         np.testing.assert_array_equal(file.placement[0][1], [0, 1, -1])
-        np.testing.assert_array_equal(np.flatnonzero(held(file)), np.unique(between))
+        np.testing.assert_array_equal(np.flatnonzero(linked(file)), np.unique(between))
+        links = file.mesh.labels.links
+        assert links.rigid.all()
+        np.testing.assert_array_equal(points[links.nodes], points[links.parents[:, 0]])
         data = to_meshio(file, cell_data={"q": {name: np.array([3, 4])}}).cell_data["q"][0]
         np.testing.assert_array_equal(data, [3, 4, np.nan])
 
@@ -98,7 +108,7 @@ def test_a_collapsed_element_is_not_cohesive():
     points[inner[[3, 2]]] = points[inner[[0, 1]]]
     file = js.from_meshio(meshio.Mesh(points, blocks))
     assert len(file.mesh.connectivity[0]) == 16
-    assert not held(file).any()
+    assert not linked(file).any()
 
 
 def test_thin_elements_of_few_digits_are_not_cohesive():
@@ -110,7 +120,7 @@ def test_thin_elements_of_few_digits_are_not_cohesive():
     quads = np.stack([node[:-1, :-1], node[1:, :-1], node[1:, 1:], node[:-1, 1:]], axis=-1).reshape(-1, 4)
     file = js.from_meshio(meshio.Mesh(points, {"quad": quads}))
     assert len(file.mesh.connectivity[0]) == 16
-    assert not held(file).any()
+    assert not linked(file).any()
 
 
 def test_boundaries_that_come_close_are_left_alone():
@@ -118,7 +128,7 @@ def test_boundaries_that_come_close_are_left_alone():
     gap = 1e-3 * np.sin(np.linspace(0, np.pi, len(points)))
     both = np.concatenate([points, points + np.c_[np.full(len(points), 1 + 1e-6), gap]])
     cells = np.concatenate([blocks["triangle"], blocks["triangle"] + len(points)])
-    assert not held(js.from_meshio(meshio.Mesh(both, {"triangle": cells}))).any()
+    assert not linked(js.from_meshio(meshio.Mesh(both, {"triangle": cells}))).any()
 
 
 # --- Periodic pairs ----------------------------------------------------------------------
@@ -144,17 +154,82 @@ def test_periodic_links_of_gmsh(tmp_path, file_format):
     x, y = np.asarray(file.mesh.points).T
     sides = (x == 0) | (np.abs(x - 1) < 1e-12)
     assert sides.sum() >= 10
-    np.testing.assert_array_equal(held(file), sides)
+    np.testing.assert_array_equal(linked(file), sides)
     assert (js.detect_constraints(file.mesh).freedom[~sides & (y > 1e-9) & (y < 1 - 1e-9)] == 2).all()
 
 
-def test_periodic_nodes_are_held():
+def periodic(links):
     points, blocks = meshes.grid("triangle", (3, 3))
-    left, right = (np.flatnonzero(points[:, 0] == x) for x in (0, 1))
-    source = meshio.Mesh(points, blocks, gmsh_periodic=[[1, (1, 2), None, np.c_[left, right]]])
-    file = js.from_meshio(source)
-    np.testing.assert_array_equal(np.flatnonzero(held(file)), np.union1d(left, right))
-    assert file.notes == ("8 nodes are linked in periodic pairs; they are held",)
+    return js.from_meshio(meshio.Mesh(points, blocks, gmsh_periodic=links(points)))
+
+
+def sides(points):
+    return [np.flatnonzero(points[:, 0] == x) for x in (0, 1)]
+
+
+@pytest.mark.parametrize("affine", [None, np.zeros(0)])
+def test_periodic_pairs_without_a_map(affine):
+    file = periodic(lambda points: [[1, (1, 2), affine, np.c_[tuple(sides(points))].astype(np.uint64)]])
+    left, right = sides(np.asarray(file.mesh.points))
+    np.testing.assert_array_equal(np.flatnonzero(linked(file)), np.union1d(left, right))
+    assert file.notes == ("8 nodes are linked in periodic pairs; they move together",)
+    np.testing.assert_array_equal(file.mesh.labels.links.rotations, np.tile(np.eye(2), (4, 1, 1)))
+
+
+def test_pairs_that_no_rigid_map_explains_are_held():
+    def mixed(points):
+        left, right = sides(points)
+        return [[1, (1, 2), None, np.c_[left, right[[0, 2, 1, 3]]]]]
+
+    file = periodic(mixed)
+    assert not linked(file).any()
+    assert held(file).sum() == 8
+    assert "no translation or rotation explains; they are held" in file.notes[0]
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_the_rotation_of_a_sector(given):
+    """Left and lower side of a square, linked by a quarter turn; the file may name the map or not."""
+    turn = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+    def quarter(points):
+        low = np.flatnonzero(points[:, 1] == 0)
+        low = low[np.argsort(points[low, 0])]
+        left = np.flatnonzero(points[:, 0] == 0)
+        left = left[np.argsort(points[left, 1])]
+        return [
+            [0, (4, 2), turn.ravel() if given else None, np.c_[left, low][-1:]],
+            [1, (1, 2), turn.ravel() if given else None, np.c_[left, low]],
+        ]
+
+    file = periodic(quarter)
+    links = file.mesh.labels.links
+    np.testing.assert_array_equal(links.rotations, np.tile(turn[:2, :2], (len(links.nodes), 1, 1)))
+    corner = np.flatnonzero((np.asarray(file.mesh.points) == 0).all(axis=1))
+    assert corner in links.nodes[links.nodes == links.parents[:, 0]]  # it is linked to itself
+
+
+def test_the_map_of_a_plane_mesh_in_space():
+    """The affine map is one of space; the links are between coordinates in the plane."""
+    points, blocks = meshes.grid("triangle", (3, 3))
+    turn, shift = meshes.rotation_matrix(3, seed=3), np.array([3.0, 1, -2])
+    quarter = turn @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ turn.T
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = quarter, shift - quarter @ shift
+    low, left = (np.flatnonzero(points[:, k] == 0) for k in (1, 0))
+    low, left = low[np.argsort(points[low, 0])], left[np.argsort(points[left, 1])]
+    space = np.c_[points, np.zeros(len(points))] @ turn.T + shift
+    pairs = np.c_[left, low]
+    np.testing.assert_allclose(space[left], space[low] @ quarter.T + affine[:3, 3], atol=1e-12)
+    links = [[0, (1, 2), affine.ravel(), pairs[-1:]]]  # one pair says nothing of the rotation by itself
+    file = js.from_meshio(meshio.Mesh(space, blocks, gmsh_periodic=links))
+    assert file.plane is not None
+    found = file.mesh.labels.links.rotations[0]
+    flat = np.asarray(file.mesh.points)
+    corner = np.flatnonzero((points == 0).all(axis=1))[0]
+    np.testing.assert_allclose(
+        flat[left] - flat[corner], (flat[low] - flat[corner]) @ found.T, rtol=0, atol=1e-12
+    )
 
 
 # --- Hanging nodes -----------------------------------------------------------------------
@@ -162,9 +237,10 @@ def test_periodic_nodes_are_held():
 
 def test_hanging_nodes_of_a_plane_mesh():
     file, meta = case("02_hanging.vtu"), case("02_hang_meta.npz")
-    np.testing.assert_array_equal(np.flatnonzero(held(file)), np.union1d(meta["hang"], meta["par"]))
+    np.testing.assert_array_equal(np.flatnonzero(linked(file)), np.union1d(meta["hang"], meta["par"]))
+    assert "they move with its nodes" in file.notes[0]
     points = np.asarray(js.smooth(file, steps=3).mesh.points)
-    np.testing.assert_allclose(points[meta["hang"]], points[meta["par"]].mean(axis=1), atol=1e-15)
+    np.testing.assert_allclose(points[meta["hang"]], points[meta["par"]].mean(axis=1), atol=1e-14)
 
 
 def refined(parts, turn=False):
@@ -192,7 +268,15 @@ def test_hanging_nodes_of_hexahedra(parts, turn):
     points, nodes, hanging, corners = refined(parts, turn)
     assert hanging.sum() == (parts + 1) ** 2 - 4
     file = js.from_meshio(meshio.Mesh(points, {"hexahedron": nodes}))
-    np.testing.assert_array_equal(held(file), hanging | corners)
+    links = file.mesh.labels.links
+    np.testing.assert_array_equal(np.unique(links.nodes), np.flatnonzero(hanging))
+    np.testing.assert_array_equal(linked(file), hanging | corners)
+    np.testing.assert_allclose(links.weights.sum(axis=1), 1, atol=1e-14)
+    led = (links.weights[..., None] * points[links.parents]).sum(axis=1)
+    np.testing.assert_allclose(led, points[links.nodes], atol=1e-14)
+    # the face between the two is no boundary: what hangs there has no constraint of its own
+    outer = sum(int((part.partner < 0).sum()) for part in find_facets(file.mesh))
+    assert outer == 5 + 5 * parts**2
     assert any(f"{hanging.sum()} nodes hang on an edge or a face" in note for note in file.notes)
 
 
@@ -201,6 +285,7 @@ def test_conforming_meshes_have_no_coupled_nodes(name):
     points, blocks = meshes.grid(name, amplitude=0.1)
     file = js.from_meshio(meshio.Mesh(points, blocks))
     assert file.mesh.labels.held is None
+    assert file.mesh.labels.links is None
     assert file.notes == ()
 
 

@@ -43,23 +43,21 @@ def placed(cells, parts, element, chosen) -> list[tuple[int, np.ndarray]]:
 
 
 def without_cohesive(points, names, numbering, notes: list[str]) -> tuple[list[np.ndarray], np.ndarray]:
-    """Masks of the elements that have a thickness, and the nodes of those that have none."""
+    """Masks of the elements that have a thickness, and the pairs of nodes that others join ``[m, 2]``."""
     blocks = [(element_type(name), nodes) for name, nodes in zip(names, numbering, strict=True)]
-    closed = without_thickness(points, blocks)
-    held, number = np.zeros(len(points), bool), sum(int(mask.sum()) for mask in closed)
+    closed, pairs = without_thickness(points, blocks)
+    number = sum(int(mask.sum()) for mask in closed)
     if number == sum(map(len, numbering)):
         raise MeshFileError(
             f"none of the {number} elements has a thickness (their facing nodes coincide, as those of "
             "cohesive cells do); give the elements between them too"
         )
-    for mask, nodes in zip(closed, numbering, strict=True):
-        held[nodes[mask]] = True
     if number:
         notes.append(
             f"{number} elements have no thickness (cohesive cells); they are neither smoothed nor counted, "
-            f"and their {int(held.sum())} nodes are held"
+            f"and their {len(np.unique(pairs))} nodes move in pairs"
         )
-    return [~mask for mask in closed], held
+    return [~mask for mask in closed], pairs
 
 
 def _distinct(name: str, nodes: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray]:

@@ -17,7 +17,7 @@ _THIN = 1e-6  # of its own extent, where nothing is there to compare an element'
 Blocks = Sequence[tuple[ElementType, np.ndarray]]
 
 
-def without_thickness(points: np.ndarray, blocks: Blocks) -> list[np.ndarray]:
+def without_thickness(points: np.ndarray, blocks: Blocks) -> tuple[list[np.ndarray], np.ndarray]:
     """Elements whose facing nodes coincide pairwise, as cohesive cells have them.
 
     Only elements that a mesh needs so count: their edges of no length belong to no other element.
@@ -27,7 +27,7 @@ def without_thickness(points: np.ndarray, blocks: Blocks) -> list[np.ndarray]:
         blocks: element types with connectivity ``[elements, k]``.
 
     Returns:
-        One mask ``[elements]`` a block.
+        One mask ``[elements]`` a block, and the pairs ``[m, 2]`` of nodes that coincide through them.
     """
     allowed = ROUNDINGS * coordinate_error(points)
     points = np.asarray(points, np.float64)
@@ -51,13 +51,26 @@ def without_thickness(points: np.ndarray, blocks: Blocks) -> list[np.ndarray]:
         if all(np.array_equal(a, b) for a, b in zip(kept, found, strict=True)):
             break
         found = kept
-    return [axis >= 0 for axis in found]
+    pairs = [np.zeros((0, 2), np.int64)]
+    for (kind, nodes), axis in zip(blocks, found, strict=True):
+        for d in range(kind.dim):
+            pairs += [nodes[axis == d][:, ends] for ends in _through(kind, d)]
+    return [axis >= 0 for axis in found], np.unique(np.concatenate(pairs), axis=0)
 
 
 def _edges_along(kind: ElementType, axis: int) -> tuple[np.ndarray, np.ndarray]:
     """Edges along a natural direction, and the others, between corners ``[m, 2]``."""
     along = kind.natural[kind.edges[:, 0], axis] != kind.natural[kind.edges[:, 1], axis]
     return kind.edges[along], kind.edges[~along]
+
+
+def _through(kind: ElementType, axis: int) -> list[list[int]]:
+    """Every node above the lowest ones in a natural direction, and the lowest one below it."""
+    bottom = kind.natural[:, axis].min()
+    below = kind.natural.copy()
+    below[:, axis] = bottom
+    lowest = np.abs(below[:, None] - kind.natural).sum(axis=-1).argmin(axis=1)
+    return [[i, int(lowest[i])] for i in range(kind.k) if kind.natural[i, axis] > bottom]
 
 
 def _closed(kind: ElementType, points: np.ndarray, nodes: np.ndarray, allowed: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from jaxsmooth.cells.table import ElementType
+from jaxsmooth.mesh.links import NodeLinks
 from jaxsmooth.mesh.topology import Facets, lengths
 from jaxsmooth.numerics.rounding import CLOSE, ROUNDINGS, coordinate_error
 
@@ -20,13 +21,14 @@ __all__ = ["find_contacts", "find_hanging"]
 
 _CHORD = 1e-3  # a node on a facet is within this part of its size, and so far from its ends
 _ARBITRARY = np.array([0.6354, 0.4873, 0.5990])  # of unit length, near no direction of a usual mesh
+_NOTHING = 1e-9  # weights below this are rounding
 _ITERATIONS = 8  # of Gauss and Newton, for the nearest point of a facet
 
 Blocks = Sequence[tuple[ElementType, np.ndarray]]
 
 
 def find_contacts(points: np.ndarray, blocks: Blocks, boundary: Sequence[Facets]) -> np.ndarray:
-    """Boundary nodes at the place of another one that no element joins them to ``[nodes]``.
+    """Pairs ``[m, 2]`` of boundary nodes of one place that no element joins.
 
     Args:
         points: coordinates ``[nodes, dim]``.
@@ -34,20 +36,18 @@ def find_contacts(points: np.ndarray, blocks: Blocks, boundary: Sequence[Facets]
         boundary: the boundary facets.
     """
     allowed, points = ROUNDINGS * coordinate_error(points), points.astype(np.float64)
-    held, on = np.zeros(len(points), bool), np.zeros(len(points), bool)
-    longest = 0.0
+    on, longest = np.zeros(len(points), bool), 0.0
     for facets in boundary:
         on[facets.nodes] = True
         longest = max(longest, lengths(points, facets.nodes[:, :2]).max(initial=0.0))
     nodes = np.flatnonzero(on)
     if len(nodes) == 0:
-        return held
+        return np.zeros((0, 2), np.int64)
     reach = min(allowed[nodes].max(), CLOSE * longest)
     pairs = nodes[cKDTree(points[nodes], leafsize=8).query_pairs(reach, output_type="ndarray")]
     allowed = np.minimum(allowed, CLOSE * _shortest(points, boundary, pairs))
     pairs = pairs[lengths(points, pairs) <= allowed[pairs].min(axis=1)]
-    held[pairs[~_in_one_element(pairs, blocks, len(points))]] = True
-    return held
+    return pairs[~_in_one_element(pairs, blocks, len(points))]
 
 
 def _shortest(points: np.ndarray, boundary: Sequence[Facets], chosen: np.ndarray) -> np.ndarray:
@@ -81,9 +81,7 @@ def _in_one_element(groups: np.ndarray, blocks: Blocks, count: int) -> np.ndarra
     return np.diff(common.indptr) > 0
 
 
-def find_hanging(
-    points: np.ndarray, blocks: Blocks, boundary: Sequence[Facets]
-) -> tuple[np.ndarray, np.ndarray]:
+def find_hanging(points: np.ndarray, blocks: Blocks, boundary: Sequence[Facets]) -> NodeLinks | None:
     """Boundary nodes inside an edge or face of an element that they are not part of.
 
     Args:
@@ -92,20 +90,20 @@ def find_hanging(
         boundary: the boundary facets.
 
     Returns:
-        Masks ``[nodes]`` of the hanging nodes, and of the nodes of the edges and faces they hang on.
+        The hanging nodes with those of the edges and faces they hang on, weighted by their shape
+        functions, or None.
     """
-    count = len(points)
-    hanging, parents, on = (np.zeros(count, bool) for _ in range(3))
+    on, links = np.zeros(len(points), bool), []
     given, points = points, points.astype(np.float64)
     listed = [(part, *_edges_of(part.type, part.nodes)) for part in boundary]
     if not listed:
-        return hanging, parents
+        return None
     crowded = np.split(
         _doubled(points, [line.segments for _, line, _ in listed], [edges for *_, edges in listed]),
         np.cumsum([len(edges) for *_, edges in listed])[:-1],
     )
     if not any(rows.any() for rows in crowded):
-        return hanging, parents
+        return None
     for part in boundary:
         on[part.nodes] = True
     search = _Search(points, ROUNDINGS * coordinate_error(given), np.flatnonzero(on))
@@ -114,9 +112,11 @@ def find_hanging(
         if part.type.dim == 2:
             faces = part.nodes[rows.reshape(-1, len(part.nodes)).any(axis=0)]
             found.append(search.inside(part.type, faces, blocks))
-        for facets, nodes in found:
-            hanging[nodes], parents[facets] = True, True
-    return hanging, parents
+        for facets, nodes, weights in found:
+            rows = np.column_stack([nodes, np.sort(facets, axis=1)])
+            once = np.unique(rows, axis=0, return_index=True)[1]  # all elements around an edge list it
+            links.append(NodeLinks.hanging(nodes[once], facets[once], weights[once], points.shape[1]))
+    return NodeLinks.join(links)
 
 
 def _edges_of(kind: ElementType, facets: np.ndarray) -> tuple[ElementType, np.ndarray]:
@@ -163,20 +163,21 @@ class _Search:
         self.points, self.allowed, self.nodes = points, allowed, nodes
         self.tree = cKDTree(points[nodes], leafsize=8)
 
-    def inside(self, kind: ElementType, facets: np.ndarray, blocks: Blocks) -> tuple[np.ndarray, np.ndarray]:
-        """Facets and nodes, one for one: a node hangs inside the facet."""
+    def inside(self, kind: ElementType, facets: np.ndarray, blocks: Blocks) -> tuple[np.ndarray, ...]:
+        """Facets and nodes, one for one, where a node hangs inside the facet, and its shape functions."""
         row, node = self._around(kind, facets)
         foot, distance = _foot(kind, self.points[facets[row]], self.points[node])
         size = np.ptp(self.points[facets[row][:, : kind.corners]], axis=1).max(axis=1, initial=0.0)
         allowed = np.maximum(self.allowed[node], self.allowed[facets[row]].max(axis=1, initial=0.0))
         within = (distance <= np.minimum(allowed, _CHORD * size)) & _interior(kind, foot)
-        row, node = row[within], node[within]
+        row, node, foot = row[within], node[within], foot[within]
         corners = facets[row][:, : kind.corners]
         groups = np.concatenate([node[:, None], corners], axis=1)
         apart = ~_in_one_element(groups, blocks, len(self.points))
-        row, node = row[apart], node[apart]
+        row, node, foot = row[apart], node[apart], foot[apart]
         hangs = self._joined(row, node, corners[apart], blocks)
-        return facets[row[hangs]], node[hangs]
+        weights = kind.shape_functions(foot[hangs])
+        return facets[row[hangs]], node[hangs], np.where(np.abs(weights) < _NOTHING, 0, weights)
 
     def _joined(self, row: np.ndarray, node: np.ndarray, corners: np.ndarray, blocks: Blocks) -> np.ndarray:
         """Nodes that elements join to a corner of their facet, directly or from one to the next.

@@ -47,7 +47,7 @@ class MeshFile:
         format: the format it is written in again, such as ``"gmsh22:binary"``, or None.
         notes: sentences for the user about what was found, or done, on the way.
         fixed: nodes that point or cell data called ``fixed`` hold ``[nodes]``; `mesh.labels.held` has
-            them too, with the nodes that belong together.
+            them too, with those of cells that are not smoothed.
         named_sets: nodes of every named set ``{name: [nodes]}``.
         placement: for every cell block of the source the block of `mesh` it went to (−1: none) and
             the element there of each of its cells (−1: none).
@@ -78,9 +78,9 @@ def from_meshio(
     Cell blocks of one type become one element block; elements that are numbered the other way round
     are mirrored (in `mesh`, not in `source`); lower-dimensional cells and material tags become
     `Mesh.labels`.  The mesh is 2D when its highest cells are and all of them lie in one plane, whichever
-    (but for noise of 1e-5 of its size).  Nodes that the file marks, or that belong together (periodic
-    pairs, parts in contact, hanging nodes, shells in a solid), are `Labels.held`; elements without
-    thickness (cohesive cells) are left out and their nodes held.
+    (but for noise of 1e-5 of its size).  Nodes that belong together (periodic pairs, parts in contact,
+    hanging nodes, the two sides of cohesive cells) are `Labels.links`; nodes that the file marks, and those
+    of shells in a solid, are `Labels.held`.  Elements without thickness (cohesive cells) are left out.
 
     Args:
         source: what meshio read.
@@ -103,7 +103,7 @@ def from_meshio(
     parts = [[k for k in chosen if cells[k][0] == name] for name in names]
     numbering, kept, element = collected(cells, names, parts, notes)
     points, plane = _in_space(points, numbering, dim)
-    open_, held = without_cohesive(points, names, numbering, notes)
+    open_, facing = without_cohesive(points, names, numbering, notes)
     placement = placed(cells, parts, element, open_)
     full = [b for b, rows in enumerate(open_) if rows.any()]
     names, parts = [names[b] for b in full], [parts[b] for b in full]
@@ -114,16 +114,17 @@ def from_meshio(
     labels = make_labels(source, cells, dim, parts, [kept[b][open_[b]] for b in full])
     mesh = Mesh(_cast(points, dtype), blocks, labels)
     fixed = held_nodes(source, len(points))
-    together, sentences = find_coupled(
+    together = find_coupled(
         points,
         mesh,
         [cell for k, cell in enumerate(cells) if k not in chosen],
         getattr(source, "gmsh_periodic", None),
-        held,
+        np.eye(3)[:dim] if plane is None else plane.axes,
+        facing,
     )
-    notes += sentences + _stretch(mesh)
-    held |= fixed | together
-    mesh = mesh.with_labels(replace(labels, held=held if held.any() else None))
+    held = fixed | together.held
+    mesh = mesh.with_labels(replace(labels, held=held if held.any() else None, links=together.links))
+    notes += together.notes + _stretch(mesh)
     if dtype is not None and mesh.points.dtype != np.dtype(dtype):
         notes.append(f"{np.dtype(dtype)} was asked for, but JAX runs without jax_enable_x64: float32 is used")
     return MeshFile(
@@ -185,7 +186,7 @@ def as_mesh(anything: Any) -> Mesh:
     `meshio.Mesh`, ``(points, {"tetra": nodes})``.
 
     A `Mesh` comes back as it is, its points traced by JAX or not; all else is read as files are, so
-    that reversed elements are turned, and nodes that belong together are held.
+    that reversed elements are turned, and nodes that belong together are linked.
 
     Raises:
         ValueError: it is none of these, or not a mesh that can be smoothed.
@@ -272,6 +273,8 @@ def _moved(file: MeshFile, points: Any) -> np.ndarray:
     used = np.zeros(len(old), bool)
     for nodes in file.mesh.connectivity:
         used[np.asarray(nodes)] = True
+    if file.mesh.labels is not None and file.mesh.labels.links is not None:
+        used |= file.mesh.labels.links.members(len(old))  # of cells without thickness, which are no elements
     coarse = np.float32 if np.float32 in (old.dtype, new.dtype) else np.float64
     changed = used[:, None] & (new.astype(coarse) != old.astype(coarse))
     if file.plane is not None:

@@ -81,22 +81,26 @@ class PatchGuard(Guard):
         stopped = jax.lax.stop_gradient
         frozen, path, start = mesh.with_points(stopped(mesh.points)), stopped(motion), stopped(before)
         admissible = path.at(frozen.points)
-        moves = (stopped(move) != 0).any(axis=-1)
+        moves = admissible.led((stopped(move) != 0).any(axis=-1))
         finite = ~admissible.together(~jnp.isfinite(stopped(move)).all(axis=-1))
         plain = jnp.where(finite[:, None], stopped(move), 0)
         needs = self._needs(frozen, moves, start)
-        more = _extra_halvings(frozen, plain, start) if self.halvings else 0
+        more = -admissible.least(-_extra_halvings(frozen, plain, start)) if self.halvings else 0
         limit = jnp.where(moves & finite, self.halvings + more, -1)
+
+        def still(count):
+            """Nodes that stay; those that follow others stay where all of these do."""
+            return ~admissible.led(count <= limit)
 
         def sweep(state):
             count, _, bad, sweeps = state
             count = count + admissible.together(bad)
             after = evaluate(moved(frozen, path, plain, fraction(count, limit)))
-            return count, after, _offenders(frozen, needs, after, count > limit), sweeps + 1
+            return count, after, _offenders(frozen, needs, after, still(count)), sweeps + 1
 
         def unfinished(state):
             count, _, bad, sweeps = state
-            return (sweeps == 0) | (admissible.together(bad) & (count <= limit)).any()
+            return (sweeps == 0) | (bad & ~still(count)).any()
 
         nothing = jnp.zeros(len(mesh.points), jnp.int32)
         state = nothing, start, nothing > 0, jnp.int32(0)

@@ -62,9 +62,9 @@ class SmartGuard(Guard):
             """Waiting nodes that gain, and no less than any node they share an element with."""
             current = frozen.with_points(points)
             gain = jnp.where(waiting, gains(current, path, plain, evaluation, noise), -jnp.inf)
-            gain = path.at(points).least(gain)
+            gain = path.at(points).least_of_equals(gain)  # what a hanging node alone would gain says nothing
             rival = patch_max(frozen, [gather(gain, nodes).max(axis=1) for nodes in frozen.connectivity])
-            return (gain > 0) & path.at(points).least(gain >= jnp.maximum(gain, rival))
+            return (gain > 0) & path.at(points).least_of_equals(gain >= jnp.maximum(gain, rival))
 
         def round_(state):
             points, evaluation, waiting, going, rounds = state

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -13,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsmooth.cells.table import ElementType, element_type
 from jaxsmooth.mesh.execution import Execution
+from jaxsmooth.mesh.links import NodeLinks
 
 __all__ = ["Labels", "Mesh"]
 
@@ -25,8 +27,9 @@ class Labels(eqx.Module):
         features: lower-dimensional cells of the file, ``[m, k]`` each.
         feature_types: their types (``vertex``, ``line``, ``triangle``, …).
         feature_tags: one int array ``[m]`` each: cells of different tags do not mix.
-        held: nodes that must not move ``[nodes]``, or None: those that a file marks, and those that
-            belong together though no element says so.
+        held: nodes that must not move ``[nodes]``, or None: those that a file marks, and those of cells
+            that are not smoothed themselves.
+        links: nodes that move with others, or None.
     """
 
     regions: tuple[Int[np.ndarray, "_"], ...]
@@ -34,6 +37,7 @@ class Labels(eqx.Module):
     feature_tags: tuple[Int[np.ndarray, "_"], ...] = ()
     feature_types: tuple[str, ...] = eqx.field(static=True, default=())
     held: Bool[np.ndarray, " nodes"] | None = None
+    links: NodeLinks | None = None
 
 
 class Mesh(eqx.Module):
@@ -106,6 +110,24 @@ class Mesh(eqx.Module):
     def with_labels(self, labels: Labels | None) -> Mesh:
         """The same mesh with other labels."""
         return eqx.tree_at(lambda m: m.labels, self, labels, is_leaf=lambda x: x is None)
+
+    def with_links(self, *links: NodeLinks) -> Mesh:
+        """The same mesh with more links between its nodes, such as those of `find_periodic`.
+
+        Raises:
+            ValueError: for links of another dimension, or of nodes that the mesh has not.
+        """
+        for part in links:
+            if part.rotations.shape[1:] != (self.dim, self.dim):
+                raise ValueError(
+                    f"the links are for {part.rotations.shape[-1]}D, the mesh is {self.dim}D; find them in it"
+                )
+            nodes = np.concatenate([part.nodes, part.parents.ravel()])
+            if nodes.size and not (nodes.min() >= 0 and nodes.max() < len(self.points)):
+                raise ValueError(f"a linked node is out of range; the mesh has {len(self.points)} nodes")
+        labels = Labels(regions=()) if self.labels is None else self.labels
+        known = () if labels.links is None else (labels.links,)
+        return self.with_labels(replace(labels, links=NodeLinks.join([*known, *links])))
 
 
 def _as_points(points: Any) -> Float[Array, "nodes dim"]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxsmooth.cells.table import ElementType
+from jaxsmooth.mesh.hanging import covered
 from jaxsmooth.mesh.record import Mesh
 
 __all__ = ["Facets", "facet_keys", "find_facets", "lengths", "node_pairs", "pair_codes", "signed_measures"]
@@ -36,8 +37,8 @@ class Facets:
 def find_facets(mesh: Mesh) -> list[Facets]:
     """All facets of a mesh, with the region on either side.
 
-    Two elements share a facet when they share its corner nodes.  Boundary facets have
-    ``partner == -1``.
+    Two elements share a facet when they share its corner nodes, or when nodes that hang on it
+    (`Labels.links`) divide it on one side.  Boundary facets have ``partner == -1``.
     """
     owners: dict[ElementType, list[tuple[np.ndarray, np.ndarray]]] = {}
     for (kind, nodes), region in zip(mesh.blocks, _regions(mesh), strict=True):
@@ -55,6 +56,8 @@ def find_facets(mesh: Mesh) -> list[Facets]:
     keys = facet_keys(np.concatenate(corners), len(mesh.points))
     regions = np.concatenate([region for _, _, region in found])
     partner = _pair(keys, regions)
+    if mesh.labels is not None and mesh.labels.links is not None:
+        _pair_hanging(mesh, found, regions, partner)
     ends = np.cumsum([len(nodes) for _, nodes, _ in found])
     return [
         Facets(kind, nodes, region, other)
@@ -84,6 +87,18 @@ def _pair(keys: np.ndarray, regions: np.ndarray) -> np.ndarray:
     first, second = order[:-1][same], order[1:][same]
     partner[first], partner[second] = regions[second], regions[first]
     return partner
+
+
+def _pair_hanging(mesh: Mesh, facets: list, regions: np.ndarray, partner: np.ndarray) -> None:
+    """Fill in the regions on the other side of facets that are divided there, and of their parts."""
+    outer = np.flatnonzero(partner < 0)
+    ends = np.searchsorted(outer, np.cumsum([len(nodes) for _, nodes, _ in facets])[:-1])
+    rows = np.split(outer, ends)
+    start = np.cumsum([0, *(len(nodes) for _, nodes, _ in facets)])
+    chosen = [(kind, nodes[r - s]) for (kind, nodes, _), r, s in zip(facets, rows, start, strict=False)]
+    pairs = outer[covered(np.asarray(mesh.points, np.float64), chosen, mesh.labels.links)]
+    partner[pairs[:, 0]] = regions[pairs[:, 1]]
+    partner[pairs[:, 1]] = regions[pairs[:, 0]]
 
 
 def _regions(mesh: Mesh) -> list[np.ndarray]:

@@ -56,14 +56,18 @@ class Both(Motion):
             raise ValueError(
                 "two motions with dependent nodes can't be joined; give all links to one of them"
             )
-        return Admissible(
-            shared(one.projectors, two.projectors), one.links if two.links is None else two.links
-        )
+        links = one.links if two.links is None else two.links
+        a, b = one.projectors, two.projectors
+        if links is not None:  # what binds a dependent node binds those that it follows
+            a, b = (b, links.common(a)) if one.links is None else (a, links.common(b))
+        return Admissible(shared(a, b), links)
 
     def retract(self, points: Field, move: Field) -> Field:
-        """One after the other."""
+        """One after the other; nodes that follow others do so in the end."""
         first = self.first.retract(points, move)
-        return self.second.retract(points, first - points)
+        second = self.second.retract(points, first - points)
+        links = self.at(points).links
+        return second if links is None else links.carried(points, second)
 
     def within(self, frame: Frame) -> Motion:
         """Both in the frame."""

@@ -12,6 +12,8 @@ from jaxsmooth.convert.meshfile import as_mesh
 from jaxsmooth.mesh.layers import layer_nodes, nodes_of, stretched
 from jaxsmooth.mesh.record import Labels
 from jaxsmooth.mesh.topology import facet_keys, find_facets
+from jaxsmooth.motion.base import Motion
+from jaxsmooth.motion.coupled import couple
 from jaxsmooth.motion.directions import Directions, Noise, facet_normals, unit_tangents
 from jaxsmooth.motion.planar import Constraints, node_mask
 
@@ -28,12 +30,13 @@ def detect_constraints(
     fixed: Any = None,
     layers: str = "hold",
     freeze_aspect: float | None = None,
-) -> Constraints:
+) -> Motion:
     """Find how every node may move so that the shape of the domain is kept.
 
     Boundary nodes slide within flat faces and along straight edges and are held elsewhere.
     So do nodes of interfaces between regions (`Mesh.labels`), of embedded surfaces and lines
     that the mesh names, and of the borders between boundary cells of different tags.
+    Nodes that belong together (`Labels.links`) move together.
 
     Args:
         mesh: a `Mesh`, or whatever else `as_mesh` takes.
@@ -49,7 +52,7 @@ def detect_constraints(
         freeze_aspect: hold the nodes of all elements of a greater aspect ratio (`aspect_ratios`).
 
     Returns:
-        The constraints.
+        `Constraints`, or `Coupled` ones where nodes follow others.
 
     Raises:
         ValueError: for an unknown choice, a mask of another length, or an aspect ratio below 1.
@@ -97,7 +100,7 @@ def detect_constraints(
     stays = np.einsum("nij,njk,nki->n", projectors[on_lines], line, line) > 1 - 1e-6
     projectors[on_lines] = line * stays[:, None, None]
     projectors[held] = 0
-    return Constraints(jnp.asarray(projectors, mesh.points.dtype))
+    return couple(Constraints(jnp.asarray(projectors, mesh.points.dtype)), mesh)
 
 
 def _add_features(

@@ -42,6 +42,27 @@ class Links(eqx.Module):
         led = (self.weights[..., None] * field[self.parents]).sum(axis=1)
         return (self.rotations * led[:, None, :]).sum(axis=-1)
 
+    def carried(self, old: Field, new: Field) -> Field:
+        """`new` points with the dependent nodes where their parents lead them from the `old` ones.
+
+        Nodes of one place stay in one place to the last bit, and so do nodes whose parents stay.
+        """
+        offset = old[self.dependent] - self.follow(old)
+        moved = (new[self.parents] != old[self.parents]).any(axis=(1, 2))
+        placed = jnp.where(moved[:, None], self.follow(new) + offset, old[self.dependent])
+        return new.at[self.dependent].set(placed)
+
+    def common(self, projectors: Float[Array, "nodes dim dim"]) -> Float[Array, "nodes dim dim"]:
+        """At parents the mean of their own projectors and those of their dependents, turned back.
+
+        What it maps onto itself, all of them do.
+        """
+        turned = jnp.swapaxes(self.rotations, -1, -2) @ projectors[self.dependent] @ self.rotations
+        leads = (self.weights != 0).astype(projectors.dtype)
+        total = projectors.at[self.parents].add(leads[..., None, None] * turned[:, None])
+        count = jnp.ones(len(projectors), projectors.dtype).at[self.parents].add(leads)
+        return total / count[:, None, None]
+
 
 class Admissible(eqx.Module):
     """The admissible displacements of a mesh at its present points.
@@ -118,9 +139,26 @@ class Admissible(eqx.Module):
         values = values.at[links.parents].min(values[links.dependent][:, None])
         return values.at[links.dependent].set(values[links.parents].min(axis=1))
 
+    def least_of_equals(self, values: Array) -> Array:
+        """The same among nodes that do all that the other does; those that hang get their parents' least."""
+        if self.links is None:
+            return values
+        links = self.links
+        equal = links.rigid[:, None] > 0
+        values = values.at[links.parents].min(
+            jnp.where(equal, values[links.dependent][:, None], values[links.parents])
+        )
+        return values.at[links.dependent].set(values[links.parents].min(axis=1))
+
     def together(self, mask: Array) -> Array:
         """Nodes of a mask ``[nodes]``, and those that they lead or follow."""
         return ~self.least(~mask)
+
+    def led(self, mask: Array) -> Array:
+        """A mask ``[nodes]`` in which nodes that follow others are if a parent is, and only then."""
+        if self.links is None:
+            return mask
+        return mask.at[self.links.dependent].set(mask[self.links.parents].any(axis=1))
 
     def _added(self, field: Field, weights: Float[Array, "links p"]) -> Field:
         links = self.links

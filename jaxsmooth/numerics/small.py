@@ -100,6 +100,6 @@ class Frame(NamedTuple):
         extent = (points.max(axis=0) - origin).max()
         return cls(origin, jnp.ldexp(jnp.ones((), points.dtype), -jnp.frexp(extent)[1]))
 
-    def into(self, points: Float[Array, "nodes dim"]) -> Float[Array, "nodes dim"]:
+    def into(self, points: Float[Array, "... dim"]) -> Float[Array, "... dim"]:
         """Points in the coordinates of the frame."""
         return (points - self.origin) * self.scale

@@ -240,10 +240,13 @@ def print_notes(out: Console, notes: tuple[str, ...]) -> None:
 
 def print_constraints(out: Console, constraints: Motion, mesh: Mesh) -> None:
     """How many nodes are held, slide, or are free."""
-    freedom, dim = constraints.at(mesh.points).freedom, mesh.dim
+    tangents, dim = constraints.at(mesh.points), mesh.dim
+    freedom = tangents.freedom
     names = ("held", "sliding on an edge", "sliding on a face", "free")
     names = (*names[:dim], names[-1])
     parts = [f"{(freedom == value).sum():,} {name}" for value, name in enumerate(names)]
+    if tangents.links is not None:
+        parts.append(f"{len(tangents.links.dependent):,} of them following others")
     out.print(f"nodes: {', '.join(parts)}")
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsmooth.cells.table import element_type
 from jaxsmooth.convert.meshfile import as_mesh
 from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.motion.base import Motion
 from jaxsmooth.motion.detect import detect_constraints
 from jaxsmooth.motion.planar import Constraints
 
@@ -49,23 +50,29 @@ class Batch(eqx.Module):
         return total / sum(m.sum(axis=1) for m in self.elements)
 
 
-def stack(meshes: Sequence[Any], constraints: Sequence[Constraints] | None = None) -> Batch:
+def stack(meshes: Sequence[Any], constraints: Sequence[Motion] | None = None) -> Batch:
     """Pad meshes of one dimension to a common shape and stack them.
 
     Args:
         meshes: each a `Mesh` or whatever else `as_mesh` takes; their blocks may differ in size and type.
-        constraints: theirs; detected by default.
+        constraints: theirs, `Constraints` each; detected by default.
 
     Returns:
         The batch.
 
     Raises:
-        ValueError: for no meshes, or meshes of different dimensions.
+        ValueError: for no meshes, meshes of different dimensions, or motions that can't be padded.
     """
     meshes = [as_mesh(mesh) for mesh in meshes]
     if not meshes or len({mesh.dim for mesh in meshes}) > 1:
         raise ValueError("stack needs meshes of one dimension, at least one")
     constraints = [detect_constraints(m) for m in meshes] if constraints is None else constraints
+    for index, motion in enumerate(constraints):
+        if not isinstance(motion, Constraints):
+            raise ValueError(
+                f"stack pads Constraints, and mesh {index} has {type(motion).__name__}; where its nodes move "
+                "together, hold them: Constraints.hold(mesh, mesh.labels.links.members(len(mesh.points)))"
+            )
     types = sorted({name for mesh in meshes for name in mesh.types})
     kinds = [element_type(name) for name in types]
     joined = [{name: [] for name in types} for _ in meshes]
