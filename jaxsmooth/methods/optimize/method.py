@@ -73,8 +73,8 @@ class Optimize(Method):
     Attributes:
         goal: ``"average"``, ``"worst"`` or ``"balanced"``: the best mean quality, the best of
             the poor elements, or both; see `GOALS`.
-        metric: ``"shape"``, the paper's q where its optimum is the ideal element, both for wedges,
-            pyramids and quadratic elements, or ``"mean_ratio"`` for all.
+        metric: ``"shape_and_corners"``, the paper's q where its optimum is the ideal element, both for
+            wedges, pyramids and quadratic elements, or ``"mean_ratio"`` for all; see `metrics.shape`.
         target: ``"free size"``, ``"own size"`` (the paper's) or ``"given size"``.
         size: for a given size, the measure of the target elements: a number, or one array a block.
         size_weight: how much the size counts beside the shape, unless it is free.
@@ -92,7 +92,7 @@ class Optimize(Method):
     """
 
     goal: str = eqx.field(static=True, default="balanced")
-    metric: str = eqx.field(static=True, default="shape")
+    metric: str = eqx.field(static=True, default="shape_and_corners")
     target: str = eqx.field(static=True, default="free size")
     size: tuple[Float[Array, " _"], ...] | Float[Array, ""] | float | None = None
     size_weight: Float[Array, ""] | float = 1.0
