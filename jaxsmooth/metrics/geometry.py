@@ -43,7 +43,7 @@ _TRIANGLES = {
 }
 
 
-def divide(top: Array, bottom: Array, otherwise: float | Array) -> Array:
+def divide(top: Array | float, bottom: Array, otherwise: Array | float) -> Array:
     """``top / bottom`` where the bottom is positive, else `otherwise`."""
     solid = bottom > 0
     return jnp.where(solid, top / jnp.where(solid, bottom, 1), otherwise)

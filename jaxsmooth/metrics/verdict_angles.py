@@ -120,7 +120,7 @@ ANGLES = (
         acceptable=(0, 0.5),
         ideal=0.0,
         larger_is_better=False,
-        note=f"{PLANE}; −1 for quadrilaterals with a side of length zero",
+        note=f"{PLANE}; −1 for quadrilaterals with a side of length zero; VTK leaves flat faces out",
     ),
     verdict(
         "warpage",
@@ -165,7 +165,7 @@ ANGLES = (
             "wedge": 2 * 0.433013 / 0.866025,
             "hexahedron": 1.0,
         },
-        note="corners only, also of quadratic elements; of an inverted one over a negative mean",
+        note="of corners, also of quadratic elements; 2 for a quadrilateral that is a point, NaN in VTK",
     ),
     verdict(
         "diagonal",
@@ -181,8 +181,8 @@ ANGLES = (
         units="length",
         range=(0, INF),
         acceptable=(0, INF),
-        ideal=6**-0.5 * 1.5**0.5 * 2**0.5,
-        note="Taylor and Flanagan 1989",
+        ideal=3**-0.5,
+        note="Taylor and Flanagan 1989; 0 where no node changes the volume, NaN in VTK",
     ),
     verdict(
         "collapse_ratio",
@@ -197,10 +197,10 @@ ANGLES = (
         {"tetra": solid.tetra_equivolume_skew},
         "lack of volume in the circumsphere",
         acceptable=(0, 0.6),
-        range=(0, INF),
+        range=(0, 1),
         ideal=0.0,
         larger_is_better=False,
-        note="1 for flat tetrahedra",
+        note="1 for flat tetrahedra, 1e30 in VTK",
     ),
     verdict(
         "squish_index",
@@ -210,6 +210,7 @@ ANGLES = (
         acceptable=(0, 0.3),
         ideal=0.0,
         larger_is_better=False,
+        note="1 or more for flat faces, which VTK leaves out",
     ),
 )
 """In the order of tables."""

@@ -249,8 +249,9 @@ def quad_distortion(points: Quad) -> Scalar:
     inner = determinant(contract(flat, jnp.asarray(kind.gradients, points.dtype)))
     nodal = determinant(contract(flat, jnp.asarray(kind.gradients_at(kind.natural), points.dtype)))
     normals = jnp.sign(nodal)
-    # of corners 0 and 2 if they agree, else of whichever agrees with corner 1
-    face = jnp.where(normals[0] * normals[2] > 0, normals[0], normals[1])
+    # of corner 0 if 2 or 1 agree with it, else of the other two
+    agrees = jnp.maximum(normals[0] * normals[2], normals[0] * normals[1]) > 0
+    face = jnp.where(agrees, normals[0], normals[1] + normals[2])
     inner_along = inner * (jnp.asarray(kind.values, points.dtype) @ normals)
     nodal_along = jnp.where(face * normals > 0, 1.0, -1.0) * jnp.abs(nodal)
     worst, size = least(jnp.concatenate([inner_along, nodal_along])), jnp.abs(inner).mean()

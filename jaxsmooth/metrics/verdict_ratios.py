@@ -86,7 +86,7 @@ RATIOS = (
         },
         "longest edge over inradius or its like",
         acceptable=(1, 3),
-        note=NO_ORIENTATION,
+        note=f"{NO_ORIENTATION}; infinite for a quadrilateral that is a point, −1e30 in VTK",
         **_ABOVE,
     ),
     verdict(
@@ -181,7 +181,8 @@ RATIOS = (
         "worst corner, centre of hexahedra included",
         range=(-(2**0.5), INF),
         acceptable=(0.2, 1.42),
-        note=f"{PLANE}; with edges of length zero 0, for tetrahedra and hexahedra infinite",
+        note=f"{PLANE}; with edges of length zero 0, infinite for tetrahedra and hexahedra, −1e30 "
+        "in VTK for wedges",
     ),
     verdict(
         "jacobian",
@@ -226,6 +227,7 @@ RATIOS = (
         "normalized_inradius",
         {"triangle": lambda points: divide(1, plane.triangle_radius_ratio(points), 0)},
         "twice the inradius over the circumradius",
+        note=f"{PLANE}; 0 for a point, 1e30 in VTK",
         **_UNIT,
     ),
     Metric(

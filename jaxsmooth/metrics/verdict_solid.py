@@ -132,7 +132,7 @@ def tetra_condition(points: Tetra) -> Scalar:
     a, b, c = points[1:] - points[0]
     frame = jnp.stack([a, (2 * b - a) / 3**0.5, (3 * c - b - a) / 6**0.5])
     normals = jnp.cross(frame, jnp.roll(frame, -1, axis=0))
-    det = determinant(frame)
+    det = 2**0.5 * tetra_jacobian(points)  # of the frame
     size = norm(frame.reshape(-1)) * norm(normals.reshape(-1))
     return jnp.sign(det) * divide(size, 3 * jnp.abs(det), 0) + jnp.where(det == 0, _INF, 0)
 
