@@ -25,6 +25,7 @@ _HOMES = {
     "mesh.record": ("Labels", "Mesh"),
     "methods": ("METHODS", "Elastic", "Laplacian", "Method", "Optimize"),
     "methods.elastic.elasticity": ("Material",),
+    "metrics.record": ("Metric",),
     "metrics.summary": ("Statistics", "statistics"),
     "metrics.table": ("METRICS", "quality", "quality_mean"),
     "motion.base": ("Motion",),
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     from jaxsmooth.mesh.record import Labels, Mesh
     from jaxsmooth.methods import METHODS, Elastic, Laplacian, Method, Optimize
     from jaxsmooth.methods.elastic.elasticity import Material
+    from jaxsmooth.metrics.record import Metric
     from jaxsmooth.metrics.summary import Statistics, statistics
     from jaxsmooth.metrics.table import METRICS, quality, quality_mean
     from jaxsmooth.motion.base import Motion

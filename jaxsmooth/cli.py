@@ -103,7 +103,8 @@ def _parser() -> argparse.ArgumentParser:
     command.set_defaults(run=_smooth)
 
     command = commands.add_parser("quality", help="print quality statistics of a mesh")
-    command.add_argument("input", nargs="?", metavar="IN", help="mesh file")
+    help = "mesh file (default: the last word behind --metric)"
+    command.add_argument("input", nargs="?", metavar="IN", help=help)
     help = "quality metrics, or all: those that the mesh can have (default: the usual six)"
     command.add_argument("--metric", action="extend", nargs="+", default=[], metavar="NAME", help=help)
     help = "write the numbers, - for standard output (default: none)"

@@ -283,14 +283,3 @@ def test_mean_ratio_is_not_their_shape():
         np.testing.assert_allclose(
             here(name, "mean_ratio", elements), here(name, "verdict_shape", elements), rtol=1e-12
         )
-
-
-def test_faces_of_quadratic_elements_are_left_out():
-    for name, quadratic in (("tetra", "tetra10"), ("quad", "quad9"), ("wedge", "wedge15")):
-        kind = element_type(quadratic)
-        assert family(kind) == name
-        nodes = jnp.asarray(kind.ideal + 0.05 * np.random.default_rng(3).uniform(-1, 1, kind.ideal.shape))
-        for metric in (*RATIOS, *ANGLES):
-            if metric.applies_to(kind) and not metric.relative:
-                assert metric.corners_only
-                assert metric(kind, nodes) == metric(element_type(name), nodes[: kind.corners])
