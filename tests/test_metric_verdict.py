@@ -3,7 +3,6 @@
 from functools import lru_cache
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -13,7 +12,6 @@ import vtk
 
 from jaxsmooth.cells.table import element_type
 from jaxsmooth.mesh.record import Mesh
-from jaxsmooth.metrics.record import family
 from jaxsmooth.metrics.shape import MEASURE
 from jaxsmooth.metrics.table import METRICS, quality
 from jaxsmooth.metrics.verdict_angles import ANGLES

@@ -62,7 +62,7 @@ def test_tables_of_the_paper(row):
 
 
 def test_table_has_all_values():
-    assert len(TABLE) == 18
+    assert len(TABLE) == 20
 
 
 def test_ideal_element(kind):
