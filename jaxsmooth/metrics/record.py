@@ -29,7 +29,7 @@ def family(kind: ElementType) -> str:
 
 @dataclass(frozen=True)
 class Metric:
-    """A number for each element of a mesh.
+    """A number for each element of a mesh.  Make it once: every new function is compiled anew.
 
         flatness = Metric("flatness", lambda kind, nodes: jnp.ptp(nodes[:, -1]), "extent in z")
         values = jaxsmooth.quality(mesh, metric=flatness)
