@@ -30,6 +30,7 @@ _HOMES = {
     "methods.optimize.goals": ("Goal", "Stage"),
     "methods.optimize.minimise": ("Minimiser",),
     "metrics.evaluation": ("Evaluation", "evaluate"),
+    "metrics.record": ("Metric",),
     "metrics.summary": ("Statistics", "statistics"),
     "metrics.table": ("METRICS", "quality", "quality_mean"),
     "motion.base": ("Motion",),
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
     from jaxsmooth.methods.optimize.goals import Goal, Stage
     from jaxsmooth.methods.optimize.minimise import Minimiser
     from jaxsmooth.metrics.evaluation import Evaluation, evaluate
+    from jaxsmooth.metrics.record import Metric
     from jaxsmooth.metrics.summary import Statistics, statistics
     from jaxsmooth.metrics.table import METRICS, quality, quality_mean
     from jaxsmooth.motion.base import Motion

@@ -104,11 +104,16 @@ def _parser() -> argparse.ArgumentParser:
     command.set_defaults(run=_smooth)
 
     command = commands.add_parser("quality", help="print quality statistics of a mesh")
-    command.add_argument("input", metavar="IN", help="mesh file")
-    help = "a quality metric; repeatable (default: all)"
-    command.add_argument("--metric", action="append", metavar="NAME", help=help)
+    help = "mesh file (default: the last word behind --metric)"
+    command.add_argument("input", nargs="?", metavar="IN", help=help)
+    help = "quality metrics, or all: those that the mesh can have (default: the usual six)"
+    command.add_argument("--metric", action="extend", nargs="+", default=[], metavar="NAME", help=help)
     help = "write the numbers, - for standard output (default: none)"
     command.add_argument("--json", metavar="FILE", help=help)
+    help = "write a row for every element: type, number, region, centroid, metrics (default: none)"
+    command.add_argument("--csv", metavar="FILE", help=help)
+    help = "write the mesh with the metrics as data of its cells (default: none)"
+    command.add_argument("--quality-data", metavar="OUT", help=help)
     _add_precision(command)
     command.set_defaults(run=_quality)
 
@@ -214,24 +219,31 @@ def _smooth(options: argparse.Namespace, outputs: Outputs) -> int:
 
 
 def _quality(options: argparse.Namespace, outputs: Outputs) -> int:
-    from jaxsmooth.files.io import read
-    from jaxsmooth.metrics.table import METRICS, metric
-    from jaxsmooth.report import report
+    from jaxsmooth.files.io import read, write_to
+    from jaxsmooth.report import quality, report
 
-    names = options.metric or list(METRICS)
-    for name in names:
-        metric(name)
-    _check_side_files(options)
+    names, options.input = quality.requested(options.metric, options.input)
+    if options.csv == "-":
+        raise ValueError("--csv -: the rows can't go to standard output; name a file")
+    data = {"--quality-data": options.quality_data} if options.quality_data is not None else {}
+    _check_side_files(options, **data)
     file = read(options.input)
-    table = report.quality_rows(file.mesh, names)
+    values = quality.measured(file.mesh, quality.chosen_metrics(names, file.mesh))
+    rows = quality.quality_rows(file.mesh, values)
     out = report.console(quiet=options.json == "-")
     report.print_file(out, file)
-    report.print_quality(out, table)
+    quality.print_report(out, file, values, rows)
+    if options.csv is not None:
+        outputs.text(options.csv, quality.csv_text(file, values))
+    if data:
+        notes = write_to(outputs, options.quality_data, file, cell_data=quality.cell_data(file.mesh, values))
+        _print_losses(out, notes, options.quality_data)
     if options.json is not None:
-        content = {"input": options.input, **report.counts(file.mesh), "quality": table, "notes": file.notes}
+        content = {"input": options.input, **report.counts(file.mesh), "quality": rows, "notes": file.notes}
         _write_json(outputs, options.json, content)
+    if options.json or options.csv or data:
         _finish(out, outputs, "wrote {}")
-    return DONE if table[0]["inverted"] == 0 else INVERTED
+    return DONE if rows[0]["inverted"] == 0 else INVERTED
 
 
 def _compare(options: argparse.Namespace, outputs: Outputs) -> int:
@@ -302,7 +314,7 @@ def _check_side_files(options: argparse.Namespace, **meshes: str) -> None:
     """Whether JSON and report can be written, and are neither a mesh nor one another."""
     from jaxsmooth.files.io import check_distinct, check_output
 
-    sides = {"--json": options.json, "--report": getattr(options, "report", None)}
+    sides = {f"--{name}": getattr(options, name, None) for name in ("json", "report", "csv")}
     sides = {name: path for name, path in sides.items() if path not in (None, "-")}
     check_distinct({"IN": options.input, **sides})
     check_distinct({**meshes, **sides})

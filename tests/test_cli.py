@@ -1,5 +1,6 @@
 """The command line, run as its user runs it; most calls in this process, to share compiles."""
 
+import csv
 import json
 import os
 import subprocess
@@ -9,10 +10,12 @@ import time
 import meshio
 import numpy as np
 import pytest
-from meshes import grid
+from meshes import grid, mixed_2d
 
 import jaxsmooth as js
 from jaxsmooth.cli import main
+from jaxsmooth.metrics.table import METRICS
+from jaxsmooth.report import quality as quality_report
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +97,66 @@ def test_quality(part, tmp_path, capsys):
     assert row["metric"] == "shape"
     assert run("quality", part) == 0
     assert "mean_ratio" in capsys.readouterr().out
+
+
+def test_quality_of_every_element(tmp_path, capsys):
+    points, blocks = mixed_2d(0.1)
+    cells = [*((name, nodes) for name, nodes in blocks.items())]
+    source = tmp_path / "in.vtu"
+    meshio.Mesh(np.c_[points, np.full(len(points), 2.0)], cells).write(source)
+    table, data = tmp_path / "q.csv", tmp_path / "q.vtu"
+    words = ("--metric", "max_angle", "taper,shape", "--csv", table, "--quality-data", data)
+    assert run("quality", source, *words) == 0
+    out = capsys.readouterr().out
+    assert f"wrote {table}, {data}" in out
+    assert max(len(line) for line in out.splitlines()[1:] if "wrote" not in line) <= 80
+    file = js.read(source)
+    with table.open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert list(rows[0]) == ["type", "element", "region", "x", "y", "z", "max_angle", "taper", "shape"]
+    written = meshio.read(data)
+    for name, nodes in blocks.items():
+        mine = [row for row in rows if row["type"] == name]
+        assert [int(row["element"]) for row in mine] == list(range(len(nodes)))
+        centres = [[float(row[axis]) for axis in "xyz"] for row in mine]
+        np.testing.assert_allclose(centres, np.c_[points[nodes].mean(axis=1), np.full(len(nodes), 2.0)])
+        for metric in ("max_angle", "taper", "shape"):
+            expected = np.asarray(js.quality(file.mesh, metric)[file.mesh.types.index(name)])
+            found = [float(row[metric] or "nan") for row in mine]
+            np.testing.assert_allclose(found, expected)
+            np.testing.assert_allclose(written.cell_data_dict[metric][name], expected)
+    # the worst by the first metric, the one with the greatest angle
+    worst = max(rows, key=lambda row: float(row["max_angle"]))
+    line = out.split("worst by max_angle")[1].splitlines()[1].split()
+    assert line[:2] == [worst["type"], worst["element"]]
+    assert float(line[2]) == pytest.approx(float(worst["max_angle"]), rel=1e-3)
+    assert "at (" + ", ".join(f"{float(worst[a]):.6g}" for a in "xyz") + ")" in out
+
+
+def test_quality_all(part, capsys):
+    assert run("quality", "--metric", "all", part) == 0  # the file may come last
+    out = capsys.readouterr().out
+    assert "min_dihedral_angle" in out or "max_angle" in out
+    assert max(len(line) for line in out.splitlines()[1:] if "note:" not in line) <= 80
+    assert run("quality", "--metric", "shape") == 2
+    assert "needs a mesh file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--csv", "--quality-data", "--json"])
+def test_quality_does_not_replace_its_input(part, option, capsys):
+    before = part.read_bytes()
+    assert run("quality", part, "--metric", "shape", option, part) == 2
+    assert part.read_bytes() == before
+
+
+def test_histogram():
+    values = np.array([-0.3, 0.0, 0.05, 0.1, 0.11, 1.0, np.nan])
+    rows = quality_report.histogram(METRICS["shape"], values)
+    assert rows[0] == ("≤ 0", 2)  # closed on the right
+    assert [count for _, count in rows[1:]] == [2, 1, 0, 0, 0, 0, 0, 0, 0, 1]
+    rows = quality_report.histogram(METRICS["aspect_ratio"], np.array([1.0, 2.0, 11.0, np.inf]))
+    assert [count for _, count in rows] == [2, 0, 0, 0, 0, 0, 0, 0, 0, 1, 1]
+    assert rows[-1][0] == "> 11"
 
 
 def test_compare(part, tmp_path, capsys):

@@ -14,10 +14,12 @@ from scipy.spatial import ConvexHull
 
 from jaxsmooth.cells.table import element_type
 from jaxsmooth.mesh.record import Mesh
-from jaxsmooth.metrics.table import METRICS, metric, quality, quality_mean, surface
+from jaxsmooth.metrics.shape import SHAPE_AND_CORNERS, surface
+from jaxsmooth.metrics.table import USUAL, named, quality, quality_mean
 from jaxsmooth.numerics.small import least
 
 KINDS = meshes.KINDS
+METRICS = {row.name: row for row in (*USUAL, SHAPE_AND_CORNERS)}  # those of all types, curved ones too
 TABLE = json.loads((Path(__file__).parent / "data" / "quality_tables.json").read_text())["elements"]
 
 
@@ -25,7 +27,7 @@ TABLE = json.loads((Path(__file__).parent / "data" / "quality_tables.json").read
 def compiled(kind):
     """All metrics of a batch of elements ``[n, k, dim]``: one compiled function a type."""
     row = element_type(kind)
-    return jax.jit(jax.vmap(lambda x: {name: m.function(row, x) for name, m in METRICS.items()}))
+    return jax.jit(jax.vmap(lambda x: {name: m(row, x) for name, m in METRICS.items()}))
 
 
 def evaluate(kind, *elements):
@@ -41,7 +43,7 @@ def gradients(kind):
     row = element_type(kind)
 
     def all_metrics(x):
-        return jnp.stack([m.function(row, x) for m in METRICS.values()])
+        return jnp.stack([m(row, x) for m in METRICS.values()])
 
     return jax.jit(jax.vmap(jax.jacrev(all_metrics)))
 
@@ -60,7 +62,7 @@ def test_tables_of_the_paper(row):
 
 
 def test_table_has_all_values():
-    assert len(TABLE) == 18
+    assert len(TABLE) == 20
 
 
 def test_ideal_element(kind):
@@ -270,7 +272,7 @@ def test_quality_of_a_mesh():
 
 def test_unknown_metric_suggests_a_name():
     with pytest.raises(ValueError, match=r"unknown metric 'scaled_jacobean'; did you mean scaled_jacobian"):
-        metric("scaled_jacobean")
+        named("scaled_jacobean")
     with pytest.raises(ValueError, match=r"unknown metric 'zzz'; known are shape, "):
         quality(Mesh(*meshes.grid("quad")), "zzz")
 

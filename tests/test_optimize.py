@@ -12,6 +12,7 @@ import pytest
 from jaxsmooth.cells.table import element_type, supported
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.methods.optimize.distortion import (
+    METRICS,
     apply_model,
     hessian_model,
     inverse_quality,
@@ -24,7 +25,7 @@ from jaxsmooth.methods.optimize.method import Optimize
 from jaxsmooth.methods.optimize.minimise import Jaxopt, Newton, Optax, Optimistix
 from jaxsmooth.methods.optimize.problem import Aggregation, problem
 from jaxsmooth.metrics.evaluation import evaluate
-from jaxsmooth.metrics.table import shape_quality
+from jaxsmooth.metrics.shape import MEAN_RATIO, SHAPE_AND_CORNERS, measure, shape_quality
 from jaxsmooth.motion.detect import detect_constraints
 from jaxsmooth.motion.planar import Constraints
 from jaxsmooth.targets import GivenSize, OwnSize
@@ -68,8 +69,8 @@ def least(mesh):
 
 
 KINDS = supported()
-# types for which "shape" is not, or not only, the mean ratio
-PAIRS = [(name, "shape") for name in KINDS] + [
+# types for which "shape_and_corners" is not, or not only, the mean ratio
+PAIRS = [(name, METRICS[0]) for name in KINDS] + [
     (name, "mean_ratio") for name in ("triangle", "quad", "tetra", "hexahedron")
 ]
 
@@ -100,13 +101,26 @@ def test_ideal_element_is_the_optimum(name, metric):
 
 
 @pytest.mark.parametrize("name", KINDS)
+def test_metric_is_the_inverse_of_what_is_minimised(name):
+    kind = element_type(name)
+    nodes = jiggled(kind)
+    mirrored = nodes.at[:, 0].multiply(-1)
+    for metric in (SHAPE_AND_CORNERS, MEAN_RATIO):
+        zero = jnp.float64(0.0)
+        e, _ = inverse_quality(kind, metric.name, zero, nodes, measure(kind, nodes), zero)
+        np.testing.assert_allclose(metric(kind, nodes), 1 / e, rtol=1e-13)
+        assert e > 1.0001
+        assert metric(kind, mirrored) == 0
+
+
+@pytest.mark.parametrize("name", KINDS)
 def test_invariance_to_similarity(name):
     kind = element_type(name)
     nodes = jiggled(kind)
     turn, _ = np.linalg.qr(RNG(3).standard_normal((kind.dim, kind.dim)))
     turn[:, 0] *= np.linalg.det(turn)
     moved = 7.0 * nodes @ jnp.asarray(turn).T + 3.0
-    values = [inverse_quality(kind, "shape", 0.0, x, 1.0, 0.0)[0] for x in (nodes, moved)]
+    values = [inverse_quality(kind, METRICS[0], 0.0, x, 1.0, 0.0)[0] for x in (nodes, moved)]
     np.testing.assert_allclose(values[0], values[1], rtol=1e-10)
 
 
@@ -115,7 +129,13 @@ def test_hessian_model_is_positive_and_its_diagonal_right(name):
     kind = element_type(name)
     aggregation = Aggregation(1.0, 1.0, 6.0, 1.2)
     *_, model = hessian_model(
-        kind, "shape", 0.5, aggregation.derivatives, jiggled(kind), jnp.float64(1.0), jnp.float64(0.0)
+        kind,
+        METRICS[0],
+        0.5,
+        aggregation.derivatives,
+        jiggled(kind),
+        jnp.float64(1.0),
+        jnp.float64(0.0),
     )
     units = jnp.eye(kind.k * kind.dim).reshape(-1, kind.k, kind.dim)
     matrix = jax.vmap(lambda u: apply_model(kind, u, model).reshape(-1))(units)
@@ -158,7 +178,8 @@ def test_vanishing_elements_are_no_way_out(name):
     kind = element_type(name)
     for eps in (0.01, 0.1, 0.5):
         scaled = [
-            inverse_quality(kind, "shape", 0.0, s * jnp.asarray(kind.ideal), 1.0, eps)[0] for s in (1, 1e-3)
+            inverse_quality(kind, METRICS[0], 0.0, s * jnp.asarray(kind.ideal), 1.0, eps)[0]
+            for s in (1, 1e-3)
         ]
         assert scaled[1] > scaled[0] + 0.5
 
@@ -337,7 +358,7 @@ def test_quality_and_shape_are_both_seen(name):
     nodes = jnp.asarray(kind.ideal) * stretch[:, None]
     both, mean = (
         jax.vmap(lambda x, m=metric: inverse_quality(kind, m, 0.0, x, 1.0, 0.0)[0])(nodes)
-        for metric in ("shape", "mean_ratio")
+        for metric in (METRICS[0], "mean_ratio")
     )
     assert (both >= mean - 1e-12).all()
     assert int(jnp.argmin(both)) == 3

@@ -9,7 +9,7 @@ pytest.importorskip("matplotlib")
 from benchmarks.paper import tables
 from benchmarks.paper.__main__ import main
 from benchmarks.paper.examples import EXAMPLES, quality_values, run, runnable
-from benchmarks.paper.printed import ELEMENTS, EVOLUTION
+from benchmarks.paper.printed import ELEMENTS, EVOLUTION, SHAPES
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.motion.detect import detect_constraints
 
@@ -46,8 +46,16 @@ def test_quadratic_variant_is_the_same_mesh():
 
 
 def test_metric_tables_agree():
-    for table in tables.metrics():
-        assert {row[-1] for row in table.rows} == {"yes"}
+    """All thirty rows: 6 + 7 and 6 + 6 + 5, four shapes each."""
+    first, second = tables.metrics()
+    rows = [*first.rows, *second.rows]
+    kinds = [row[0] for row in rows]
+    assert [kinds.count(kind) for kind in SHAPES] == [6, 7, 6, 6, 5]
+    assert {row[-1] for row in rows} == {"yes"}
+    values = [cell for row in rows for cell in row[2:6]]
+    assert len(values) == 120
+    # the text says the same as the mark
+    assert max(abs(float(cell[:5]) - float(cell[7:12])) for cell in values) < 2e-3
 
 
 @pytest.mark.parametrize("key", ["1", "4"])

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from jaxsmooth.assembly import cut, each
 from jaxsmooth.cells.table import ElementType
 from jaxsmooth.mesh.record import Mesh
-from jaxsmooth.metrics.table import min_jacobian, scaled_jacobian, shape_quality
+from jaxsmooth.metrics.shape import min_jacobian, scaled_jacobian, shape_quality
 from jaxsmooth.metrics.validity import determinant_bound
 from jaxsmooth.numerics.small import Frame
 

@@ -14,7 +14,7 @@ from jaxsmooth.assembly import gather
 from jaxsmooth.convert.meshfile import as_mesh
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.metrics.evaluation import Evaluation, evaluate
-from jaxsmooth.metrics.table import scaled_jacobian
+from jaxsmooth.metrics.shape import scaled_jacobian
 from jaxsmooth.metrics.validity import inverted
 
 __all__ = ["POOR", "Statistics", "evaluated", "statistics"]

@@ -22,7 +22,7 @@ from jaxsmooth.convert.meshfile import MeshFile
 from jaxsmooth.files.outputs import Outputs
 from jaxsmooth.guards.acceptance import POOR
 from jaxsmooth.mesh.record import Mesh
-from jaxsmooth.metrics.table import METRICS, quality
+from jaxsmooth.metrics.table import quality
 from jaxsmooth.metrics.validity import inverted
 from jaxsmooth.motion.base import Motion
 from jaxsmooth.runs.driver import SmoothResult, StepRecord
@@ -37,7 +37,6 @@ __all__ = [
     "movable_elements",
     "print_compare",
     "print_comparison",
-    "quality_rows",
     "write_html",
 ]
 
@@ -160,34 +159,6 @@ def _finite(value: Any) -> Any:
     return value
 
 
-def quality_rows(mesh: Mesh, names: list[str]) -> list[dict[str, Any]]:
-    """One row of statistics for every metric and every element block."""
-    rows = []
-    for name in names:
-        row = METRICS[name]
-        for kind, block in zip(mesh.types, quality(mesh, name), strict=True):
-            values = np.asarray(block, np.float64)
-            low, high = row.acceptable
-            rows.append(
-                _finite(
-                    {
-                        "metric": name,
-                        "type": kind,
-                        "elements": len(values),
-                        "min": values.min(),
-                        "avg": values.mean(),
-                        "max": values.max(),
-                        "std": values.std(ddof=1) if len(values) > 1 else 0.0,
-                        "unacceptable": int((~((values >= low) & (values <= high))).sum()),
-                    }
-                )
-            )
-    tangled = sum(int(part.sum()) for part in inverted(mesh))
-    for entry in rows:
-        entry["inverted"] = tangled
-    return rows
-
-
 def compare_row(
     name: str, mesh: Mesh, result: SmoothResult | None, constraints: Motion, seconds: dict
 ) -> dict[str, Any]:
@@ -288,20 +259,6 @@ def print_comparison(out: Console, before: Mesh, result: SmoothResult) -> None:
     for row in comparison(before, result):
         table.add_row(*row)
     out.print(table)
-
-
-def print_quality(out: Console, rows: list[dict[str, Any]]) -> None:
-    """The table of ``quality``."""
-    table = Table(box=None, pad_edge=False)
-    for name in ("metric", "type", "elements", "min", "avg", "max", "std", "unacceptable"):
-        table.add_column(name, justify="left" if name in ("metric", "type") else "right", no_wrap=True)
-    for row in rows:
-        numbers = [_number(row[name]) for name in ("min", "avg", "max", "std")]
-        count, bad = f"{row['elements']:,}", f"{row['unacceptable']:,}"
-        table.add_row(row["metric"], row["type"], count, *numbers, bad)
-    out.print(table)
-    if rows and rows[0]["inverted"]:
-        out.print(f"{rows[0]['inverted']:,} elements are inverted", style="red")
 
 
 def _number(value: float | None) -> str:

@@ -13,10 +13,10 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsmooth.cells.table import ElementType
+from jaxsmooth.metrics.shape import CORNER_WEIGHT, MEAN_RATIO, SHAPE_AND_CORNERS, excess, sample_gradients
 from jaxsmooth.numerics.small import cofactors, contract, determinant, power
 
 __all__ = [
@@ -30,11 +30,9 @@ __all__ = [
     "regularisation",
 ]
 
-METRICS = ("shape", "mean_ratio")
+METRICS = (SHAPE_AND_CORNERS.name, MEAN_RATIO.name)
 _EPS, _EPS_SLOPE = 0.1, 0.2  # ε of a degenerate mesh, and its growth with the worst inversion
 _KEEP = 4.0  # size weight per ε of elements below their size
-_SKEW = 0.5  # weight of the corner term beside the isoperimetric one
-_ROUND = 0.02  # radius of the rounded kink of `_excess`
 
 Nodes = Float[Array, "k dim"]
 Scalar = Float[Array, ""] | float
@@ -68,37 +66,19 @@ def _slope(det: Array, eps: Array | float) -> Array:
 
 
 def isoperimetric(kind: ElementType, metric: str) -> bool:
-    """Whether the paper's q serves as the metric.
-
-    It does where it is largest on the ideal element.
-    """
-    return metric == "shape" and kind.ideal_is_optimum
+    """Whether the paper's q serves as the metric: where it is largest on the ideal element."""
+    return metric == SHAPE_AND_CORNERS.name and kind.ideal_is_optimum
 
 
 def _bounded(kind: ElementType, metric: str) -> bool:
     """Whether the paper's q only bounds the metric, which is the mean ratio: where some elements
     have less surface than the ideal one."""
-    return metric == "shape" and not isoperimetric(kind, metric)
+    return metric == SHAPE_AND_CORNERS.name and not isoperimetric(kind, metric)
 
 
 def _sampled(kind: ElementType, metric: str) -> bool:
     """Whether the metric looks at the Jacobian at sample points: where it varies, or alone counts."""
     return not isoperimetric(kind, metric) or not kind.constant_jacobian
-
-
-def _points(kind: ElementType) -> np.ndarray:
-    """Gradients at the sample points: the nodes of linear elements, nodes and quadrature points
-    of others.  Validity is tested at both in any case."""
-    every = kind.validity_gradients
-    nodal = len(every) - len(kind.gradients)
-    return every[:nodal] if kind.linear and nodal else every
-
-
-def _excess(ratio: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """About ``max(ratio − 1, 0)``, rounded to be smooth and convex, with two derivatives."""
-    x = jnp.maximum(ratio - 1, 0)
-    total = x + _ROUND
-    return x * x / total, x * (x + 2 * _ROUND) / total**2, jnp.where(x > 0, 2 * _ROUND**2 / total**3, 0)
 
 
 class _Volume(NamedTuple):
@@ -157,7 +137,7 @@ def _samples(
 ) -> tuple[Scalar, Nodes, Samples]:
     """Mean over the sample points of ``|A|² / (d det(A)^(2/d))``, its gradient, and the samples."""
     dim = kind.dim
-    points = jnp.asarray(_points(kind), nodes.dtype)
+    points = jnp.asarray(sample_gradients(kind), nodes.dtype)
     frames = contract(nodes, points)
     if isoperimetric(kind, metric):
         # the columns' own lengths: by the arithmetic and geometric means the gradient of the
@@ -205,19 +185,19 @@ def _metric(kind: ElementType, metric: str, size_weight, nodes: Nodes, size, eps
     value = size_weight * ((stretch + 1 / stretch) / 2 - 1)
     gradient = size_weight * (1 - 1 / stretch**2) / (2 * size) * volume.gradient
     surface = samples = None
-    if metric == "shape":
+    if metric == SHAPE_AND_CORNERS.name:
         surface = _surface(kind, nodes)
         ratio = (surface.value / kind.ideal_surface) ** 2 / volume.value ** (2 * (dim - 1) / dim)
         slope = (
             2 * ratio * (surface.gradient / surface.value - (dim - 1) / dim * volume.gradient / volume.value)
         )
         if _bounded(kind, metric):
-            ratio, rise, _ = _excess(ratio)
+            ratio, rise, _ = excess(ratio)
             slope = rise * slope
         value, gradient = value + ratio, gradient + slope
     if _sampled(kind, metric):
         mean, slope, samples = _samples(kind, metric, nodes, size, eps)
-        weight = _SKEW if isoperimetric(kind, metric) else 1.0
+        weight = CORNER_WEIGHT if isoperimetric(kind, metric) else 1.0
         value = value + (weight * (mean - 1) if isoperimetric(kind, metric) else mean)
         gradient = gradient + weight * slope
     return _Metric(value, gradient, volume, surface, samples)
@@ -228,7 +208,9 @@ def inverse_quality(
 ) -> tuple[Scalar, Nodes]:
     """e ≥ 1 of one element, and its gradient ``[k, dim]``.
 
-    ``shape``: the inverse of the paper's q (Eqs. 1–5, β = 2), ``(S/S_ideal)² / V^(2(d−1)/d)``.
+    For ε = 0 and no size weight 1/e is the metric of `jaxsmooth.metrics.shape` of the same name, which
+    defines it.
+    ``shape_and_corners``: the inverse of the paper's q (Eqs. 1–5, β = 2), ``(S/S_ideal)² / V^(2(d−1)/d)``.
     q is blunt about corners, so elements whose Jacobian varies add the excess of the mean over
     the sample points of ``|A|² / (d det(A)^(2/d))``; for quadrilaterals and hexahedra with the
     columns of A normalised, which leaves aspect ratios to q: it is the scaled Jacobian to the
@@ -239,7 +221,7 @@ def inverse_quality(
 
     Args:
         kind: the element type.
-        metric: ``"shape"`` or ``"mean_ratio"``.
+        metric: one of `METRICS`.
         size_weight: of ``(τ + 1/τ)/2 − 1``, τ the measure over the target's; 0 leaves it free, but
             with ε elements below their size are kept from vanishing.
         nodes: ``[k, dim]``.
@@ -296,7 +278,7 @@ def hessian_model(
         change = surface.gradient / surface.value - volume.gradient / volume.value
         weight = first
         if _bounded(kind, metric):
-            _, rise, bend = _excess(ratio)
+            _, rise, bend = excess(ratio)
             weight = first * rise
             slope = surface.gradient / surface.value - (dim - 1) / dim * volume.gradient / volume.value
             vectors.append(jnp.sqrt(first * bend) * 2 * ratio * slope)
@@ -306,7 +288,7 @@ def hessian_model(
         pull = (turned[:, :, None] * tangents[:, None]).sum(axis=(0, -1))
         pull = weight * 2 * ratio / surface.value * pull
     if samples is not None:
-        weight = first * (_SKEW if isoperimetric(kind, metric) else 1)
+        weight = first * (CORNER_WEIGHT if isoperimetric(kind, metric) else 1)
         samples = samples._replace(factors=weight * samples.factors)
     return found.value, found.gradient, Model(pull, samples, jnp.stack(vectors))
 
@@ -322,7 +304,7 @@ def apply_model(kind: ElementType, move: Nodes, model: Model) -> Nodes:
         force = force + (model.surface[:, :, None] * move).sum(axis=1)
     if model.samples is not None:
         frames, cof, factors, inverse = model.samples
-        points = jnp.asarray(_points(kind), move.dtype)
+        points = jnp.asarray(sample_gradients(kind), move.dtype)
         change = contract(move, points) * inverse[:, None, :]
         a, c = (frames * change).sum(axis=(-1, -2)), (cof * change).sum(axis=(-1, -2))
         plain, mixed, bulk = factors[:, 0], factors[:, 1], factors[:, 2]
@@ -340,7 +322,7 @@ def model_diagonal(kind: ElementType, model: Model) -> Float[Array, "k dim dim"]
         blocks = blocks + jnp.diagonal(model.surface)[:, None, None] * eye
     if model.samples is not None:
         frames, cof, factors, inverse = model.samples
-        points = jnp.asarray(_points(kind), eye.dtype) * inverse[:, None, :]
+        points = jnp.asarray(sample_gradients(kind), eye.dtype) * inverse[:, None, :]
         a = (frames[:, None] * points[:, :, None, :]).sum(axis=-1)
         c = (cof[:, None] * points[:, :, None, :]).sum(axis=-1)
         plain, mixed, bulk = (factors[:, i, None, None, None] for i in range(3))

@@ -22,6 +22,8 @@ from jaxsmooth.methods.optimize.goals import BALANCED, GOALS, UNTANGLE, Goal
 from jaxsmooth.methods.optimize.minimise import Minimiser, Newton
 from jaxsmooth.methods.optimize.problem import Aggregation, Problem, Scalar, problem
 from jaxsmooth.metrics.evaluation import Evaluation
+from jaxsmooth.metrics.record import Metric
+from jaxsmooth.metrics.shape import SHAPE_AND_CORNERS
 from jaxsmooth.metrics.summary import POOR
 from jaxsmooth.motion.base import Motion
 from jaxsmooth.numerics.small import Frame
@@ -58,13 +60,20 @@ def _goal(value: Goal | str) -> Goal:
     return GOALS[value] if isinstance(value, str) else value
 
 
+def _metric(value: Metric | str) -> str:
+    name = value if isinstance(value, str) else value.name
+    if name not in METRICS:
+        raise ValueError(f"the metric must be one of {', '.join(METRICS)}; got {name!r}")
+    return name
+
+
 class Optimize(Method):
     """Maximise the quality of all elements, starting from the elastic method's mesh.
 
     Attributes:
         goal: `AVERAGE`, `WORST` or `BALANCED`, or one of your own; a name of `GOALS` will do.
-        metric: ``"shape"``, the paper's q where its optimum is the ideal element, both for wedges,
-            pyramids and quadratic elements, or ``"mean_ratio"`` for all.
+        metric: `SHAPE_AND_CORNERS`, the paper's q where its optimum is the ideal element, both for wedges,
+            pyramids and quadratic elements, or `MEAN_RATIO` for all (`metrics.shape`); their names will do.
         target: `FreeSize`, `OwnSize` (the paper's) or `GivenSize`.
         pivot: of n elements, ``pivot · √n`` count as poor: the value of the next is the pivot of
             the aggregation.
@@ -80,7 +89,7 @@ class Optimize(Method):
     """
 
     goal: Goal = eqx.field(static=True, converter=_goal, default=BALANCED)
-    metric: str = eqx.field(static=True, default="shape")
+    metric: str = eqx.field(static=True, converter=_metric, default=SHAPE_AND_CORNERS)
     target: Target = FreeSize()
     pivot: Float[Array, ""] | float = 0.5
     minimiser: Minimiser = Newton()
@@ -89,10 +98,6 @@ class Optimize(Method):
     untangling_steps: int = 10
     untangling_stages: int = eqx.field(static=True, default=20)
     guard: Guard | None = _VALID
-
-    def __check_init__(self):
-        if self.metric not in METRICS:
-            raise ValueError(f"metric must be one of {', '.join(METRICS)}, got {self.metric!r}")
 
     @property
     def acceptance(self) -> AcceptanceRule:

@@ -283,7 +283,7 @@ def problem(
     motion: Motion,
     sizes: tuple[Float[Array, " _"], ...],
     aggregation: Aggregation,
-    metric: str = "shape",
+    metric: str = "shape_and_corners",
     size_weight: Scalar | float = 0.0,
 ) -> Problem:
     """The objective of a mesh.
@@ -293,7 +293,7 @@ def problem(
         motion: what the nodes may do.
         sizes: measure of the target elements, one array a block; they also normalise the determinants.
         aggregation: φ.
-        metric: ``"shape"`` or ``"mean_ratio"``.
+        metric: ``"shape_and_corners"`` or ``"mean_ratio"``.
         size_weight: see `inverse_quality`.
     """
     dtype = mesh.points.dtype
