@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 _HOMES = {
+    "cache": ("keep_compiled",),
     "cells.table": ("element_type",),
     "convert.meshfile": ("MeshFile", "as_mesh", "from_meshio"),
     "convert.periodic": ("find_periodic",),
@@ -46,6 +47,7 @@ _HOME = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = sorted(_HOME)
 
 if TYPE_CHECKING:
+    from jaxsmooth.cache import keep_compiled
     from jaxsmooth.cells.table import element_type
     from jaxsmooth.convert.meshfile import MeshFile, as_mesh, from_meshio
     from jaxsmooth.convert.periodic import find_periodic

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxsmooth import __version__
 from jaxsmooth.files.outputs import Outputs, ending
+from jaxsmooth.options import parser
 from jaxsmooth.report.terminal import (
     close_standard_output,
     complain,
@@ -32,11 +32,6 @@ if TYPE_CHECKING:
 __all__ = ["main"]
 
 DONE, BAD_INPUT, INVERTED, INTERRUPTED = 0, 2, 3, 130
-_METHODS = (
-    "elastic, elastic-extended, laplacian, smart-laplacian, weighted-laplacian, smart-weighted-laplacian, "
-    "optimize"
-)
-_GOALS = ("average", "worst", "balanced")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -56,7 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
         program = ending(lambda: _interrupted(outputs), INTERRUPTED)
     try:
         with program, outputs:
-            return _run_command(_parser().parse_args(arguments), outputs)
+            return _run_command(parser(_COMMANDS).parse_args(arguments), outputs)
     except KeyboardInterrupt:
         _interrupted(outputs)
         return INTERRUPTED
@@ -72,7 +67,8 @@ def _interrupted(outputs: Outputs) -> None:
 
 def _run_command(options: argparse.Namespace, outputs: Outputs) -> int:
     try:
-        _set_up_jax(getattr(options, "precision", "float64"))
+        _check_input(options)
+        _set_up_jax(options)
         return options.run(options, outputs)
     except Exception as error:
         text = sentence(error)
@@ -82,95 +78,21 @@ def _run_command(options: argparse.Namespace, outputs: Outputs) -> int:
         return BAD_INPUT
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="jaxsmooth",
-        description="Improve finite-element meshes by moving their nodes.",
-        epilog="exit codes: 0 done; 2 bad input or usage, nothing written; "
-        "3 done, but inverted elements remain; 130 interrupted",
-    )
-    parser.add_argument("--version", action="version", version=f"jaxsmooth {__version__}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-
-    command = commands.add_parser("smooth", help="read a mesh, smooth it, write it")
-    command.add_argument("input", metavar="IN", help="mesh file in any format that meshio reads, or .npz")
-    command.add_argument("output", metavar="OUT", help="where to write; the name chooses the format")
-    help = f"one of {_METHODS} (default: elastic)"
-    command.add_argument("--method", default="elastic", metavar="NAME", help=help)
-    command.add_argument("--force", action="store_true", help="allow OUT to be IN (default: refuse)")
-    help = "write a report with pictures; needs matplotlib (default: none)"
-    command.add_argument("--report", metavar="FILE.html", help=help)
-    _add_run_options(command)
-    command.set_defaults(run=_smooth)
-
-    command = commands.add_parser("quality", help="print quality statistics of a mesh")
-    help = "mesh file (default: the last word behind --metric)"
-    command.add_argument("input", nargs="?", metavar="IN", help=help)
-    help = "quality metrics, or all: those that the mesh can have (default: the usual six)"
-    command.add_argument("--metric", action="extend", nargs="+", default=[], metavar="NAME", help=help)
-    help = "write the numbers, - for standard output (default: none)"
-    command.add_argument("--json", metavar="FILE", help=help)
-    help = "write a row for every element: type, number, region, centroid, metrics (default: none)"
-    command.add_argument("--csv", metavar="FILE", help=help)
-    help = "write the mesh with the metrics as data of its cells (default: none)"
-    command.add_argument("--quality-data", metavar="OUT", help=help)
-    _add_precision(command)
-    command.set_defaults(run=_quality)
-
-    command = commands.add_parser("compare", help="run several methods on a mesh, side by side")
-    command.add_argument("input", metavar="IN", help="mesh file; it is only read")
-    help = f"some of {_METHODS} (default: all)"
-    command.add_argument("--methods", default=None, metavar="A,B,…", help=help)
-    _add_run_options(command)
-    command.set_defaults(run=_compare)
-
-    command = commands.add_parser("demo", help="smooth the mesh that ships with the package")
-    help = "folder for its files (default: jaxsmooth-demo)"
-    command.add_argument("directory", nargs="?", default="jaxsmooth-demo", metavar="DIR", help=help)
-    command.set_defaults(run=_demo)
-    return parser
+def _check_input(options: argparse.Namespace) -> None:
+    """A file that is not there is missed at once, before JAX is loaded."""
+    path = getattr(options, "input", None)
+    if path is not None and not os.path.exists(path):
+        raise FileNotFoundError(f"{path}: there is no such file; check the name")
 
 
-def _add_precision(command: argparse.ArgumentParser) -> None:
-    help = "of the computation (default: float64)"
-    command.add_argument("--precision", choices=("float64", "float32"), default="float64", help=help)
-
-
-def _add_run_options(command: argparse.ArgumentParser) -> None:
-    add = command.add_argument
-    help = (
-        "make exactly N steps: the run ends earlier only where no node can move or nothing would get better "
-        "(default: at most 10, and the end when a step changes little)"
-    )
-    add("--steps", type=int, default=None, metavar="N", help=help)
-    help = f"of the method optimize: one of {', '.join(_GOALS)} (default: balanced)"
-    add("--goal", choices=_GOALS, default=None, metavar="NAME", help=help)
-    choices = ("slide", "fixed")
-    help = "what boundary nodes do: slide on flat faces and straight edges, or fixed (default: slide)"
-    add("--boundary", choices=choices, default="slide", help=help)
-    help = "the same for the nodes between materials (default: slide)"
-    add("--interfaces", choices=choices, default="slide", help=help)
-    help = "hold straight folds shallower than this, as parts of curved faces (default: 0)"
-    add("--feature-angle", type=float, default=0.0, metavar="DEG", help=help)
-    help = "hold the nodes of elements stretched beyond A, a number above 1 (default: none)"
-    add("--freeze-aspect", type=float, default=None, metavar="A", help=help)
-    help = "hold the nodes of a named set; repeatable (default: none but those that the file marks)"
-    add("--fix", action="append", default=[], metavar="NAME", help=help)
-    help = (
-        "move the nodes of opposite faces together, along axes such as xy (default: as the file links them)"
-    )
-    add("--periodic", default=None, metavar="AXES", help=help)
-    help = "write history and timings, - for standard output (default: none)"
-    add("--json", metavar="FILE", help=help)
-    help = "print only errors, what OUT can't hold, and what stays inverted (default: progress and a table)"
-    add("-q", "--quiet", action="store_true", help=help)
-    _add_precision(command)
-
-
-def _set_up_jax(precision: str) -> None:
+def _set_up_jax(options: argparse.Namespace) -> None:
     import jax
 
-    jax.config.update("jax_enable_x64", precision == "float64")
+    from jaxsmooth.cache import keep_compiled
+
+    jax.config.update("jax_enable_x64", options.precision == "float64")
+    if not options.no_cache:
+        keep_compiled()
     try:
         jax.default_backend()
     except (RuntimeError, AssertionError) as error:
@@ -406,3 +328,6 @@ def _finish(out: Console, outputs: Outputs, message: str) -> None:
 
 if __name__ == "__main__":
     sys.exit(main())
+
+
+_COMMANDS = {"smooth": _smooth, "quality": _quality, "compare": _compare, "demo": _demo}

@@ -308,18 +308,20 @@ def test_help_does_not_load_jax():
 
 
 def test_the_help_names_every_method():
-    from jaxsmooth.cli import _METHODS
     from jaxsmooth.methods import METHODS
+    from jaxsmooth.options import METHODS as NAMES
 
-    assert _METHODS.split(", ") == list(METHODS)
+    assert NAMES.split(", ") == list(METHODS)
 
 
 def test_the_help_says_the_defaults():
-    from jaxsmooth.cli import _GOALS, _parser
+    from jaxsmooth.cli import _COMMANDS
     from jaxsmooth.methods.optimize.goals import GOALS
+    from jaxsmooth.options import GOALS as NAMES
+    from jaxsmooth.options import parser
 
-    assert list(GOALS) == list(_GOALS)
-    (commands,) = (a.choices for a in _parser()._actions if a.choices)
+    assert list(GOALS) == list(NAMES)
+    (commands,) = (a.choices for a in parser(_COMMANDS)._actions if a.choices)
     for command in commands.values():
         options = [a for a in command._actions if (a.option_strings or a.nargs) and a.dest != "help"]
         assert [a.dest for a in options if "(default: " not in (a.help or "")] == []

@@ -26,7 +26,6 @@ __all__ = [
     "SHAPE_AND_CORNERS",
     "edge_ratio",
     "excess",
-    "isoperimetric",
     "mean_ratio",
     "measure",
     "min_jacobian",
@@ -105,7 +104,7 @@ def sample_gradients(kind: ElementType) -> np.ndarray:
     quadrature points of quadratic ones, once where the Jacobian is constant."""
     every = kind.validity_gradients
     nodal = len(every) - len(kind.gradients)
-    return every[:nodal] if kind.order == 1 and nodal else every
+    return every[:nodal] if kind.linear and nodal else every
 
 
 def _inverse_mean_ratio(kind: ElementType, frames: Float[Array, "s dim dim"]) -> tuple[Scalar, Array]:
@@ -128,14 +127,6 @@ def mean_ratio(kind: ElementType, nodes: Nodes) -> Scalar:
     return jnp.where(valid, 1 / inverse, 0)
 
 
-def isoperimetric(kind: ElementType) -> bool:
-    """Whether the paper's q is largest on the ideal element.
-
-    Not for wedges and pyramids, nor for quadratic elements, which raise it by bulging.
-    """
-    return kind.name in ("triangle", "quad", "tetra", "hexahedron")
-
-
 def excess(ratio: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     """About ``max(ratio − 1, 0)``, rounded to be smooth and convex, with two derivatives."""
     x = jnp.maximum(ratio - 1, 0)
@@ -155,14 +146,14 @@ def shape_and_corners(kind: ElementType, nodes: Nodes) -> Scalar:
     dim = kind.dim
     volume = measure(kind, nodes)
     frames = contract(nodes, jnp.asarray(sample_gradients(kind), nodes.dtype))
-    if isoperimetric(kind):
+    if kind.ideal_is_optimum:
         lengths = norm(jnp.swapaxes(frames, -1, -2))
         frames = frames / jnp.where(lengths > 0, lengths, 1)[:, None, :]
     mean, valid = _inverse_mean_ratio(kind, frames)
     valid = valid & (volume > 0)
     size = jnp.where(valid, volume, 1) ** (2 * (dim - 1) / dim)
     ratio = jnp.where(valid, surface(kind, nodes) / kind.ideal_surface, 1) ** 2 / size
-    if not isoperimetric(kind):
+    if not kind.ideal_is_optimum:
         e = mean + excess(ratio)[0]
     else:
         e = ratio if kind.constant_jacobian else ratio + CORNER_WEIGHT * (mean - 1)

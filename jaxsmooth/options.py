@@ -1,0 +1,105 @@
+"""The options of the command line; they are known without loading JAX."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping
+
+from jaxsmooth import __version__
+
+__all__ = ["GOALS", "METHODS", "parser"]
+
+METHODS = (
+    "elastic, elastic-extended, laplacian, smart-laplacian, weighted-laplacian, smart-weighted-laplacian, "
+    "optimize"
+)
+GOALS = ("average", "worst", "balanced")
+
+
+def parser(runs: Mapping[str, Callable[..., int]]) -> argparse.ArgumentParser:
+    """The parser; the options of a command have its function as `run`."""
+    root = argparse.ArgumentParser(
+        prog="jaxsmooth",
+        description="Improve finite-element meshes by moving their nodes.",
+        epilog="exit codes: 0 done; 2 bad input or usage, nothing written; "
+        "3 done, but inverted elements remain; 130 interrupted",
+    )
+    root.add_argument("--version", action="version", version=f"jaxsmooth {__version__}")
+    commands = root.add_subparsers(required=True, metavar="COMMAND")
+
+    command = commands.add_parser("smooth", help="read a mesh, smooth it, write it")
+    command.add_argument("input", metavar="IN", help="mesh file in any format that meshio reads, or .npz")
+    command.add_argument("output", metavar="OUT", help="where to write; the name chooses the format")
+    help = f"one of {METHODS} (default: elastic)"
+    command.add_argument("--method", default="elastic", metavar="NAME", help=help)
+    command.add_argument("--force", action="store_true", help="allow OUT to be IN (default: refuse)")
+    help = "write a report with pictures; needs matplotlib (default: none)"
+    command.add_argument("--report", metavar="FILE.html", help=help)
+    _add_run_options(command)
+    command.set_defaults(run=runs["smooth"])
+
+    command = commands.add_parser("quality", help="print quality statistics of a mesh")
+    help = "mesh file (default: the last word behind --metric)"
+    command.add_argument("input", nargs="?", metavar="IN", help=help)
+    help = "quality metrics, or all: those that the mesh can have (default: the usual six)"
+    command.add_argument("--metric", action="extend", nargs="+", default=[], metavar="NAME", help=help)
+    help = "write the numbers, - for standard output (default: none)"
+    command.add_argument("--json", metavar="FILE", help=help)
+    help = "write a row for every element: type, number, region, centroid, metrics (default: none)"
+    command.add_argument("--csv", metavar="FILE", help=help)
+    help = "write the mesh with the metrics as data of its cells (default: none)"
+    command.add_argument("--quality-data", metavar="OUT", help=help)
+    _add_precision(command)
+    command.set_defaults(run=runs["quality"])
+
+    command = commands.add_parser("compare", help="run several methods on a mesh, side by side")
+    command.add_argument("input", metavar="IN", help="mesh file; it is only read")
+    help = f"some of {METHODS} (default: all)"
+    command.add_argument("--methods", default=None, metavar="A,B,…", help=help)
+    _add_run_options(command)
+    command.set_defaults(run=runs["compare"])
+
+    command = commands.add_parser("demo", help="smooth the mesh that ships with the package")
+    help = "folder for its files (default: jaxsmooth-demo)"
+    command.add_argument("directory", nargs="?", default="jaxsmooth-demo", metavar="DIR", help=help)
+    _add_precision(command)
+    command.set_defaults(run=runs["demo"])
+    return root
+
+
+def _add_precision(command: argparse.ArgumentParser) -> None:
+    help = "of the computation (default: float64)"
+    command.add_argument("--precision", choices=("float64", "float32"), default="float64", help=help)
+    help = "compile anew: by default compiled programs are kept for the next run, in the user's cache folder"
+    command.add_argument("--no-cache", action="store_true", help=help)
+
+
+def _add_run_options(command: argparse.ArgumentParser) -> None:
+    add = command.add_argument
+    help = (
+        "make exactly N steps: the run ends earlier only where no node can move or nothing would get better "
+        "(default: at most 10, and the end when a step changes little)"
+    )
+    add("--steps", type=int, default=None, metavar="N", help=help)
+    help = f"of the method optimize: one of {', '.join(GOALS)} (default: balanced)"
+    add("--goal", choices=GOALS, default=None, metavar="NAME", help=help)
+    choices = ("slide", "fixed")
+    help = "what boundary nodes do: slide on flat faces and straight edges, or fixed (default: slide)"
+    add("--boundary", choices=choices, default="slide", help=help)
+    help = "the same for the nodes between materials (default: slide)"
+    add("--interfaces", choices=choices, default="slide", help=help)
+    help = "hold straight folds shallower than this, as parts of curved faces (default: 0)"
+    add("--feature-angle", type=float, default=0.0, metavar="DEG", help=help)
+    help = "hold the nodes of elements stretched beyond A, a number above 1 (default: none)"
+    add("--freeze-aspect", type=float, default=None, metavar="A", help=help)
+    help = "hold the nodes of a named set; repeatable (default: none but those that the file marks)"
+    add("--fix", action="append", default=[], metavar="NAME", help=help)
+    help = (
+        "move the nodes of opposite faces together, along axes such as xy (default: as the file links them)"
+    )
+    add("--periodic", default=None, metavar="AXES", help=help)
+    help = "write history and timings, - for standard output (default: none)"
+    add("--json", metavar="FILE", help=help)
+    help = "print only errors, what OUT can't hold, and what stays inverted (default: progress and a table)"
+    add("-q", "--quiet", action="store_true", help=help)
+    _add_precision(command)
