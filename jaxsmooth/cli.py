@@ -270,8 +270,8 @@ def _demo(options: argparse.Namespace, outputs: Outputs) -> int:
 
 
 def _check_before_smoothing(options: argparse.Namespace) -> None:
+    from jaxsmooth.files.formats.table import format_of_suffix
     from jaxsmooth.files.io import check_output
-    from jaxsmooth.files.reading import format_of_suffix
 
     _check_run_options(options)
     check_output(options.output, options.input, force=options.force)

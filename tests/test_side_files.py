@@ -20,7 +20,6 @@ from meshes import grid
 import jaxsmooth as js
 from jaxsmooth.cli import main
 from jaxsmooth.convert.meshfile import MeshFileError
-from jaxsmooth.files import exports
 from jaxsmooth.report import report as reports
 from jaxsmooth.runs import driver as smoothing
 
@@ -367,7 +366,6 @@ def test_out_of_memory(name, error, part, out, capsys, monkeypatch):
 
 
 def test_errors_of_the_program_keep_their_traceback(part, out, monkeypatch):
-    monkeypatch.setattr(exports, "write_source", raising(TypeError("a bug")))
     monkeypatch.setattr("jaxsmooth.files.io.write_source", raising(TypeError("a bug")))
     with pytest.raises(TypeError, match="a bug"):
         smooth_three(part, out)

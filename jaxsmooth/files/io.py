@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from jaxsmooth.convert.meshfile import MeshFile, MeshFileError, from_meshio, to_meshio
+from jaxsmooth.files.formats.record import stem_format
+from jaxsmooth.files.formats.table import format_of_suffix
 from jaxsmooth.files.outputs import Outputs
-from jaxsmooth.files.reading import MissingFileError, format_of_suffix, read_source, stem_format
+from jaxsmooth.files.reading import MissingFileError, read_source
 from jaxsmooth.files.writing import check_types, write_source
 
 __all__ = [

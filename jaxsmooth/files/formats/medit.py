@@ -11,8 +11,11 @@ import meshio
 import numpy as np
 
 from jaxsmooth.convert.labels import HELD
+from jaxsmooth.convert.regions import integers
+from jaxsmooth.files.formats.record import Format, Holds
+from jaxsmooth.files.reduction import as_tags, material_name
 
-__all__ = ["MEDIT_SETS", "append_medit_sets", "read_medit"]
+__all__ = ["MEDIT", "read_medit", "write_medit"]
 
 _CELLS = {
     "Edges": "line",
@@ -30,7 +33,7 @@ _REQUIRED = {
     "RequiredTriangles": "triangle",
     "RequiredQuadrilaterals": "quad",
 }
-MEDIT_SETS = ("Corners", "RequiredVertices")
+_SETS = ("Corners", "RequiredVertices")
 _BINARY_SETS = {13: "Corners", 15: "RequiredVertices"}
 
 
@@ -68,7 +71,7 @@ def _mesh(sections: list[tuple[str, str]]) -> tuple[meshio.Mesh, list[str]]:
             if len(table):
                 cells.append((_CELLS[key], table[:, :-1] - 1))
                 tags.append(table[:, -1])
-        elif key in MEDIT_SETS:
+        elif key in _SETS:
             sets[key] = _rows(key, body, 1, np.int64)[:, 0] - 1
         elif key in _REQUIRED:
             required[key] = _rows(key, body, 1, np.int64)[:, 0] - 1
@@ -134,10 +137,33 @@ def _binary_sets(content: bytes) -> dict[str, np.ndarray]:
     return sets
 
 
-def append_medit_sets(path: Path, sets: dict[str, np.ndarray]) -> None:
-    """Add sets of nodes to a text file that meshio wrote."""
-    text = path.read_text().rstrip().removesuffix("End")
-    for name, members in sets.items():
-        numbers = "\n".join(map(str, (np.asarray(members, dtype=np.int64) + 1).tolist()))
-        text += f"{name}\n{len(members)}\n{numbers}\n"
-    path.write_text(text + "\nEnd\n")
+def _reduce(mesh: meshio.Mesh, dim: int) -> list[str]:
+    lost, name = [*mesh.point_data, *mesh.cell_data], material_name(mesh, dim)
+    mesh.cell_data = {"medit:ref": as_tags(mesh.cell_data[name])} if name else {}
+    values = integers(mesh.point_data["medit:ref"]) if "medit:ref" in mesh.point_data else None
+    mesh.point_data = {"medit:ref": values} if values is not None else {}
+    return [n for n in lost if n not in (name, "medit:ref")]
+
+
+def write_medit(path: Path, mesh: meshio.Mesh, dim: int, variant: str = "") -> list[str]:
+    """Write a mesh as text or, where the name ends in ``.meshb``, binary; only text has room for sets."""
+    sets, mesh.point_sets = mesh.point_sets, {}
+    meshio.write(path, mesh, file_format="medit")
+    if path.suffix.lower() == ".meshb":
+        return [f"binary medit files are written without sets: {', '.join(sets)}"] if sets else []
+    if sets:
+        text = path.read_text().rstrip().removesuffix("End")
+        for name, members in sets.items():
+            numbers = "\n".join(map(str, (np.asarray(members, dtype=np.int64) + 1).tolist()))
+            text += f"{name}\n{len(members)}\n{numbers}\n"
+        path.write_text(text + "\nEnd\n")
+    return []
+
+
+MEDIT = Format(
+    "medit",
+    (".mesh", ".meshb"),
+    read_medit,
+    write_medit,
+    Holds(types=frozenset(_NODES), sets=frozenset(_SETS), reduce=_reduce),
+)

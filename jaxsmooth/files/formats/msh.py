@@ -16,9 +16,9 @@ from pathlib import Path
 
 import meshio
 import numpy as np
-from meshio.gmsh.common import _meshio_to_gmsh_order, _meshio_to_gmsh_type
 
 from jaxsmooth.convert.regions import GROUPS, recall
+from jaxsmooth.files.formats.mshtypes import CODES, in_gmsh_order
 
 __all__ = [
     "keep_groups",
@@ -313,9 +313,9 @@ def _element_rows(mesh):
     yield [("<u8", [len(mesh.cells), total, 1, total])]
     first = 1
     for k, cells in enumerate(mesh.cells):
-        nodes = _meshio_to_gmsh_order(cells.type, cells.data)
+        nodes = in_gmsh_order(cells.type, cells.data)
         tag = int(mesh.cell_data["gmsh:geometrical"][k][0])
-        yield [("<i4", [cells.dim, tag, _meshio_to_gmsh_type[cells.type]]), ("<u8", len(nodes))]
+        yield [("<i4", [cells.dim, tag, CODES[cells.type]]), ("<u8", len(nodes))]
         yield [("<u8", np.column_stack([np.arange(first, first + len(nodes)), nodes.astype(np.int64) + 1]))]
         first += len(nodes)
 

@@ -9,15 +9,14 @@ import re
 from collections.abc import Iterator
 
 import numpy as np
-from meshio._common import num_nodes_per_cell
-from meshio.gmsh.common import _gmsh_to_meshio_type
 
 from jaxsmooth.convert.checks import parse_numbers
+from jaxsmooth.files.formats.mshtypes import NODES_OF
 
-__all__ = ["check_msh", "entity_groups"]
+__all__ = ["Section", "check_msh", "entity_groups", "msh_format"]
 
 
-class _Section:
+class Section:
     """The numbers of a section, taken from its begin to its end."""
 
     def __init__(self, content: bytes, name: str, binary: bool, size: int):
@@ -28,7 +27,7 @@ class _Section:
         if not binary:
             self.numbers = parse_numbers(self.body, f"its section ${name}")
 
-    def take(self, count: int, kind: str = "i") -> np.ndarray:
+    def take(self, count: int | np.integer, kind: str = "i") -> np.ndarray:
         """The next numbers: ``i`` integers, ``n`` sizes and tags, ``d`` coordinates."""
         if self.binary:
             dtype = np.dtype({"i": "<i4", "n": f"<u{self.size}", "d": "<f8"}[kind])
@@ -60,7 +59,7 @@ class _Section:
 _CUT = "the file is damaged or cut short"
 
 
-def _format(content: bytes) -> tuple[str, bool, int] | None:
+def msh_format(content: bytes) -> tuple[str, bool, int] | None:
     found = re.search(rb"\$MeshFormat\s+(\d(?:\.\d+)?)\s+([01])\s+(\d+)", content[:4096])
     return None if found is None else (found[1].decode(), found[2] == b"1", int(found[3]))
 
@@ -69,7 +68,7 @@ def check_msh(content: bytes) -> None:
     """Raise `ValueError` where sections don't end, counts are wrong, or tags of nodes are not there.
 
     Knows 2.x and 4.1; of 4.0 it looks at the ends of sections only."""
-    if (found := _format(content)) is None:
+    if (found := msh_format(content)) is None:
         return
     version, binary, size = found
     for name in re.findall(rb"^\$(?!End)(\w+)[ \t]*\r?$", content, re.MULTILINE):
@@ -79,7 +78,7 @@ def check_msh(content: bytes) -> None:
         raise ValueError(f"it does not end with the end of a section; {_CUT}")
     if version == "4.0" or b"$Nodes" not in content or b"$Elements" not in content:
         return
-    nodes, elements = (_Section(content, name, binary, size) for name in ("Nodes", "Elements"))
+    nodes, elements = (Section(content, name, binary, size) for name in ("Nodes", "Elements"))
     tags = _nodes2(nodes) if version[0] == "2" else _nodes4(nodes)
     _check_tags(tags)
     whole = tags[-1] - tags[0] == len(tags) - 1 and bool((np.diff(tags) == 1).all())  # the usual case
@@ -106,7 +105,7 @@ def _check_tags(tags: np.ndarray) -> None:
         raise ValueError(f"it has two nodes with the tag {values[times > 1][0]}; {_CUT}")
 
 
-def _nodes2(section: _Section) -> np.ndarray:
+def _nodes2(section: Section) -> np.ndarray:
     count = section.line()
     if section.binary:
         table = np.dtype([("tag", "<i4"), ("x", "<f8", (3,))])
@@ -121,7 +120,7 @@ def _nodes2(section: _Section) -> np.ndarray:
     return tags
 
 
-def _elements2(section: _Section) -> Iterator[np.ndarray]:
+def _elements2(section: Section) -> Iterator[np.ndarray]:
     """Nodes of the elements, in runs of one type and one number of tags."""
     left = section.line()
     while left:
@@ -147,13 +146,13 @@ def _elements2(section: _Section) -> Iterator[np.ndarray]:
     section.end()
 
 
-def _nodes_of(code: int) -> int:
-    if code not in _gmsh_to_meshio_type:
+def _nodes_of(code: int | np.integer) -> int:
+    if int(code) not in NODES_OF:
         raise ValueError(f"elements of Gmsh's type {code} are not supported")
-    return num_nodes_per_cell[_gmsh_to_meshio_type[code]]
+    return NODES_OF[int(code)]
 
 
-def _nodes4(section: _Section) -> np.ndarray:
+def _nodes4(section: Section) -> np.ndarray:
     blocks, count = section.take(4, "n")[:2]
     found = [np.zeros(0, np.int64)]
     for _ in range(blocks):
@@ -168,7 +167,7 @@ def _nodes4(section: _Section) -> np.ndarray:
     return tags
 
 
-def _elements4(section: _Section) -> Iterator[np.ndarray]:
+def _elements4(section: Section) -> Iterator[np.ndarray]:
     blocks, count = section.take(4, "n")[:2]
     total = 0
     for _ in range(blocks):
@@ -184,10 +183,10 @@ def _elements4(section: _Section) -> Iterator[np.ndarray]:
 
 def entity_groups(content: bytes) -> dict[tuple[int, int], list[int]]:
     """The physical groups of the entities ``{(dim, tag): groups}`` of a 4.1 file."""
-    found = _format(content)
+    found = msh_format(content)
     if found is None or not found[0].startswith("4") or found[0] == "4.0" or b"$Entities" not in content:
         return {}
-    section = _Section(content, "Entities", found[1], found[2])
+    section = Section(content, "Entities", found[1], found[2])
     groups = {}
     for dim, count in enumerate(section.take(4, "n")):
         for _ in range(count):

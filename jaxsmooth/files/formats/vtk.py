@@ -1,16 +1,26 @@
-"""Whether VTK's files hold what their headers say; meshio (5.3.5) takes what is there."""
+"""VTK's legacy files: read by meshio (5.3.5), which takes what is there whatever the headers say."""
 
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import meshio
+import numpy as np
 
 from jaxsmooth.convert.checks import check_last_line
+from jaxsmooth.files.formats.record import Format, Holds
 
-__all__ = ["check_vtk", "check_vtu"]
+__all__ = ["VTK", "VTK42", "check_vtk", "pad_pairs", "read_vtk"]
 
 _CUT = "the file is damaged or cut short"
+
+
+def read_vtk(path: Path) -> tuple[meshio.Mesh, list[str]]:
+    """A legacy file of any version."""
+    mesh = meshio.read(path, file_format="vtk")
+    check_vtk(path.read_bytes(), mesh)
+    return mesh, []
 
 
 def check_vtk(content: bytes, mesh: meshio.Mesh) -> None:
@@ -37,10 +47,51 @@ def _counts(content: bytes, key: str) -> list[int]:
     return [] if found is None else [int(word) for word in found.groups() if word]
 
 
-def check_vtu(content: bytes, mesh: meshio.Mesh) -> None:
-    """Raise `ValueError` where an XML file has other counts than `mesh`, which meshio read from it."""
-    cells = sum(len(block) for block in mesh.cells)
-    for key, found in (("Points", len(mesh.points)), ("Cells", cells)):
-        said = [int(n) for n in re.findall(rb"NumberOf" + key.encode() + rb"\s*=\s*[\"'](\d+)", content)]
-        if said and sum(said) != found:
-            raise ValueError(f"it says NumberOf{key} {sum(said)}, and has {found}; {_CUT}")
+def pad_pairs(mesh: meshio.Mesh) -> None:
+    """Give data of two components a third, for VTK's vectors have three."""
+
+    def padded(values: np.ndarray) -> np.ndarray:
+        two = values.ndim == 2 and values.shape[1] == 2
+        return np.pad(values, ((0, 0), (0, 1))) if two else values
+
+    mesh.point_data = {name: padded(values) for name, values in mesh.point_data.items()}
+    mesh.cell_data = {name: [padded(part) for part in parts] for name, parts in mesh.cell_data.items()}
+
+
+def _write(path: Path, mesh: meshio.Mesh, variant: str, name: str) -> list[str]:
+    pad_pairs(mesh)
+    mesh.point_data = {name.replace(" ", "_"): v for name, v in mesh.point_data.items()}
+    mesh.cell_data = {name.replace(" ", "_"): v for name, v in mesh.cell_data.items()}
+    meshio.write(path, mesh, file_format=name, binary=variant == "binary")
+    return []
+
+
+def _sniff(head: bytes) -> tuple[int, str]:
+    """Version and variant."""
+    version = re.match(rb"# vtk DataFile Version (\d+)\.", head)
+    lines = head.splitlines()
+    ascii = len(lines) > 2 and lines[2].strip().upper() == b"ASCII"
+    return int(version[1]) if version else 0, "ascii" if ascii else "binary"
+
+
+VTK = Format(
+    "vtk",
+    (".vtk",),
+    read_vtk,
+    lambda path, mesh, dim, variant: _write(path, mesh, variant, "vtk"),
+    Holds(any_data=True, space=True),
+    sniff=lambda head: _sniff(head)[1] if _sniff(head)[0] >= 5 else None,
+    variants=("binary", "ascii"),
+)
+"""Version 5.1."""
+
+VTK42 = Format(
+    "vtk42",
+    (".vtk",),
+    read_vtk,
+    lambda path, mesh, dim, variant: _write(path, mesh, variant, "vtk42"),
+    Holds(any_data=True, space=True),
+    sniff=lambda head: _sniff(head)[1],
+    variants=("binary", "ascii"),
+)
+"""Versions before 5."""
