@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 
 import meshio
 import numpy as np
+from jaxtyping import Float
 
 from jaxsmooth.cells.table import element_type, supported
 from jaxsmooth.convert.regions import NOT_SETS
-from jaxsmooth.files.formats.record import Format, Holds
+from jaxsmooth.files.formats.hdf5 import is_hdf5, replace_array
+from jaxsmooth.files.formats.record import Format, Holds, Patched, Source
+from jaxsmooth.files.numbers import check_columns, check_old
 from jaxsmooth.files.reduction import as_tags, material_name
 
 __all__ = ["EXODUS", "EXODUS_BLOCKS", "EXODUS_ORDER", "extend_exodus", "read_exodus", "write_exodus"]
@@ -118,6 +122,36 @@ _EXODUS_NAMES = {
     "WEDGE15": "wedge15",
 }
 
+
+def patch_exodus(
+    source: Source, old: Float[np.ndarray, "nodes dim"], new: Float[np.ndarray, "nodes dim"]
+) -> Patched:
+    """The file with other coordinates: ``coordx``, ``coordy``, ``coordz``, or all of them in ``coord``."""
+    import netCDF4
+
+    content = source.content
+    with netCDF4.Dataset("memory", memory=content) as file:
+        file.set_auto_mask(False)
+        names = [name for name in ("coordx", "coordy", "coordz", "coord") if name in file.variables]
+        found = np.concatenate([np.atleast_2d(file.variables[name][:]) for name in names]).T
+    check_old(found, old)
+    check_columns(found.shape[1], old, new)
+    values = (
+        dict(zip(names, new.T, strict=False)) if names != ["coord"] else {"coord": new.T[: found.shape[1]]}
+    )
+    if is_hdf5(content):
+        for name, array in values.items():
+            content = replace_array(content, name, array)
+        return Patched(content)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "mesh.e"
+        path.write_bytes(content)
+        with netCDF4.Dataset(path, "r+") as file:
+            for name, array in values.items():
+                file.variables[name][:] = array
+        return Patched(path.read_bytes())
+
+
 EXODUS = Format(
     "exodus",
     (".e", ".exo", ".ex2"),
@@ -125,4 +159,5 @@ EXODUS = Format(
     write_exodus,
     Holds(types=frozenset({"vertex", "line", "line3", *supported()}), sets=True, reduce=_reduce),
     needs="netCDF4",
+    patch=patch_exodus,
 )

@@ -18,6 +18,7 @@ from jaxsmooth.files.formats.msh import (
     write_data_sections,
     write_msh41,
 )
+from jaxsmooth.files.formats.mshnodes import patch_msh
 from jaxsmooth.files.formats.mshraw import check_msh, entity_groups
 from jaxsmooth.files.formats.record import Format, Holds
 from jaxsmooth.files.reduction import GMSH_TAGS, as_tags, material_name
@@ -83,6 +84,7 @@ GMSH22 = Format(
     Holds(any_data=True, groups=True, space=True),
     sniff=lambda head: _sniff(head, "gmsh22"),
     variants=("binary", "ascii"),
+    patch=patch_msh,
 )
 """Version 2."""
 
@@ -94,5 +96,6 @@ GMSH = Format(
     Holds(any_data=True, groups=True, private=frozenset({"gmsh:bounding_entities"})),
     sniff=lambda head: _sniff(head, "gmsh"),
     variants=("binary", "ascii"),
+    patch=patch_msh,
 )
 """Version 4; written as 4.1."""

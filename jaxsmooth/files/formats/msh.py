@@ -1,6 +1,7 @@
 """Gmsh's .msh files where meshio (5.3.5) falls short: repairs before it reads, and a 4.1 writer.
 
 - 2.2: data of cells are split wrongly between blocks, so they are read here.
+- 4.x: nodes with parametric coordinates are refused, so those are left out.
 - 4.1: entities without a physical group beside others with one make meshio refuse the file, so
   those get the group 0, which is how meshio says "none".
 - 4.1 written by meshio can't be read again when an entity has no nodes of its own, when one has
@@ -18,6 +19,7 @@ import meshio
 import numpy as np
 
 from jaxsmooth.convert.regions import GROUPS, recall
+from jaxsmooth.files.formats.mshnodes import without_parameters
 from jaxsmooth.files.formats.mshtypes import CODES, in_gmsh_order
 
 __all__ = [
@@ -46,6 +48,7 @@ def repaired_msh(content: bytes) -> bytes:
         return content
     if found[1] == b"2":
         return re.sub(rb"\$ElementData\r?\n.*?\$EndElementData[^\n]*\n?", b"", content, flags=re.DOTALL)
+    content = without_parameters(content)
     if found[1] == b"4" and found[2] != b"0":
         return _with_physical_groups(content, found[3] == b"1", int(found[4]))
     return content

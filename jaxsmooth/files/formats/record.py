@@ -43,11 +43,17 @@ class Patched:
         content: its bytes.
         notes: what the user should know.
         companions: other files that belong to it, by name; they go into the same folder.
+        inputs: files beside the source that must not be replaced.
+        refers: files, relative to the folder of the source, that the result names and that stay there.
+        precision: to which the file holds coordinates, of the largest of them.
     """
 
     content: bytes
     notes: tuple[str, ...] = ()
     companions: dict[str, bytes] = field(default_factory=dict)
+    inputs: tuple[Path, ...] = ()
+    refers: tuple[str, ...] = ()
+    precision: float = 1e-12
 
 
 Patch = Callable[[Source, Float[np.ndarray, "nodes dim"], Float[np.ndarray, "nodes dim"]], Patched]

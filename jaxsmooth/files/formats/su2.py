@@ -10,11 +10,13 @@ from pathlib import Path
 
 import meshio
 import numpy as np
+from jaxtyping import Float
 
 from jaxsmooth.cells.table import element_type
 from jaxsmooth.convert.checks import check_last_line, parse_numbers
 from jaxsmooth.convert.regions import recall
-from jaxsmooth.files.formats.record import Format, Holds
+from jaxsmooth.files.formats.record import Format, Holds, Patched, Source, UnpatchableError
+from jaxsmooth.files.numbers import Places, blanked, put_text, tokens
 from jaxsmooth.files.reduction import UNKEPT, keep_boundary_tags, material_name, sets_as_masks
 
 __all__ = ["SU2", "read_su2", "write_su2"]
@@ -236,4 +238,30 @@ def _markers(mesh: meshio.Mesh, outside: list[int]) -> dict[str, dict[int, np.nd
     return found
 
 
-SU2 = Format("su2", (".su2",), read_su2, write_su2, Holds(types=frozenset(_CODES), sets=True, reduce=_reduce))
+def patch_su2(
+    source: Source, old: Float[np.ndarray, "nodes dim"], new: Float[np.ndarray, "nodes dim"]
+) -> Patched:
+    """The file with other coordinates."""
+    content = source.content.replace(b"\r\n", b" \n").replace(b"\r", b"\n")  # of the same length
+    content = blanked(content, b"%")
+    head = re.search(rb"^[ \t]*NPOIN[ \t]*=[ \t]*(\d+)[^\n]*\n", content, re.M | re.I)
+    if head is None:
+        raise UnpatchableError("it has no section NPOIN")
+    following = re.compile(rb"^[^\n=]*=", re.M).search(content, head.end())
+    starts, ends = tokens(content, head.end(), following.start() if following else len(content))
+    count = int(head[1])
+    if not count or len(starts) % count:
+        raise UnpatchableError("the lines of its nodes don't have equally many numbers")
+    columns = slice(0, old.shape[1])
+    places = Places(starts.reshape(count, -1)[:, columns], ends.reshape(count, -1)[:, columns])
+    return Patched(put_text(source.content, places, old, new))
+
+
+SU2 = Format(
+    "su2",
+    (".su2",),
+    read_su2,
+    write_su2,
+    Holds(types=frozenset(_CODES), sets=True, reduce=_reduce),
+    patch=patch_su2,
+)

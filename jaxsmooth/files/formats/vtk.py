@@ -7,11 +7,13 @@ from pathlib import Path
 
 import meshio
 import numpy as np
+from jaxtyping import Float
 
 from jaxsmooth.convert.checks import check_last_line
-from jaxsmooth.files.formats.record import Format, Holds
+from jaxsmooth.files.formats.record import Format, Holds, Patched, Source, UnpatchableError
+from jaxsmooth.files.numbers import Places, put_binary, put_text, tokens
 
-__all__ = ["VTK", "VTK42", "check_vtk", "pad_pairs", "read_vtk"]
+__all__ = ["VTK", "VTK42", "check_vtk", "pad_pairs", "patch_vtk", "read_vtk"]
 
 _CUT = "the file is damaged or cut short"
 
@@ -66,6 +68,30 @@ def _write(path: Path, mesh: meshio.Mesh, variant: str, name: str) -> list[str]:
     return []
 
 
+def patch_vtk(
+    source: Source, old: Float[np.ndarray, "nodes dim"], new: Float[np.ndarray, "nodes dim"]
+) -> Patched:
+    """The file with other coordinates, in its own precision."""
+    content = source.content
+    head = re.search(rb"^[ \t]*POINTS[ \t]+(\d+)[ \t]+(\w+)[ \t]*\r?\n", content, re.M | re.I)
+    if head is None:
+        raise UnpatchableError("it has no section POINTS")
+    count, kind = int(head[1]), head[2].decode().lower()
+    index = 3 * np.arange(count)[:, None] + np.arange(3)
+    real = {"float": np.dtype(">f4"), "double": np.dtype(">f8")}.get(kind)
+    if real is None:
+        raise UnpatchableError(f"its coordinates are of the type {kind}")
+    if _sniff(content[:4096])[1] == "binary":
+        content = put_binary(content, head.end() + real.itemsize * index, real, old, new)
+    else:
+        last = re.compile(rb"^[ \t]*[A-Za-z]", re.M).search(content, head.end())
+        starts, ends = tokens(content, head.end(), last.start() if last else len(content))
+        if len(starts) < index.size:
+            raise UnpatchableError("its section POINTS ends early")
+        content = put_text(content, Places(starts[index], ends[index]), old, new)
+    return Patched(content)
+
+
 def _sniff(head: bytes) -> tuple[int, str]:
     """Version and variant."""
     version = re.match(rb"# vtk DataFile Version (\d+)\.", head)
@@ -82,6 +108,7 @@ VTK = Format(
     Holds(any_data=True, space=True),
     sniff=lambda head: _sniff(head)[1] if _sniff(head)[0] >= 5 else None,
     variants=("binary", "ascii"),
+    patch=patch_vtk,
 )
 """Version 5.1."""
 
@@ -93,5 +120,6 @@ VTK42 = Format(
     Holds(any_data=True, space=True),
     sniff=lambda head: _sniff(head)[1],
     variants=("binary", "ascii"),
+    patch=patch_vtk,
 )
 """Versions before 5."""

@@ -6,9 +6,12 @@ import re
 from pathlib import Path
 
 import meshio
+import numpy as np
+from jaxtyping import Float
 
-from jaxsmooth.files.formats.record import Format, Holds
+from jaxsmooth.files.formats.record import Format, Holds, Patched, Source
 from jaxsmooth.files.formats.vtk import pad_pairs
+from jaxsmooth.files.formats.vtuarrays import replace_points
 
 __all__ = ["VTU", "check_vtu", "read_vtu", "write_vtu"]
 
@@ -38,4 +41,11 @@ def write_vtu(path: Path, mesh: meshio.Mesh, dim: int, variant: str = "") -> lis
     return []
 
 
-VTU = Format("vtu", (".vtu",), read_vtu, write_vtu, Holds(any_data=True, space=True))
+def patch_vtu(
+    source: Source, old: Float[np.ndarray, "nodes dim"], new: Float[np.ndarray, "nodes dim"]
+) -> Patched:
+    """The file with other coordinates, in its own precision and encoding."""
+    return Patched(replace_points(source.content, old, new))
+
+
+VTU = Format("vtu", (".vtu",), read_vtu, write_vtu, Holds(any_data=True, space=True), patch=patch_vtu)
