@@ -1,8 +1,8 @@
 """What goes in comes out: the bytes of the input with other coordinates in them.
 
-A format that can find the coordinates in its files (`Format.patch`) is written so where output and input are of
-one format.  What was made is read again, and must have the coordinates that were asked for and the cells of the
-input; else the file is written anew, and a note says so.
+A format that can find the coordinates in its files (`Format.patch`) is written so where output and input are
+of one format.  What was made is read again, and must have the coordinates that were asked for and the cells
+of the input; else the file is written anew, and a note says so.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import os
 import struct
 import tempfile
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import meshio
@@ -66,6 +67,12 @@ def patch_file(
     except (ValueError, LookupError, OSError, struct.error, zlib.error) as error:
         text = " ".join(str(error).split())[:200]
         raise UnpatchableError(f"the coordinates could not be found in it ({text})") from error
+    here, there = output.parent.resolve(), file.original.path.parent.resolve()
+    if patched.refers and here != there:
+        told = (
+            f"{output.name} refers to {', '.join(patched.refers)} beside it; copy from {there} what is there"
+        )
+        patched = replace(patched, notes=(*patched.notes, told))
     return patched
 
 
@@ -74,14 +81,15 @@ def _check(
 ) -> None:
     """Read what was made; raise `UnpatchableError` where it isn't the mesh with these coordinates."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"mesh{source.path.suffix}"
+        path = Path(folder, *"abcdefgh", f"mesh{source.path.suffix}")  # deep, for names with ../ in them
+        path.parent.mkdir(parents=True)
         path.write_bytes(patched.content)
         for name, content in patched.companions.items():
             (path.parent / name).write_bytes(content)
         for name in patched.refers:
-            link = path.parent / name
+            link = Path(os.path.normpath(path.parent / name))
             link.parent.mkdir(parents=True, exist_ok=True)
-            os.symlink((source.path.parent / name).resolve(), link)
+            link.symlink_to((source.path.parent / name).resolve())
         again = record.read(path)[0]
     found = plain(again.points)
     size = np.abs(new).max(initial=0.0)

@@ -35,7 +35,8 @@ GMSH_TAGS = ("gmsh:physical", "gmsh:geometrical")
 _FOLDED = {folded(name) for name in REGION_NAMES}
 
 UNKEPT = "files:unkept"
-"""In `meshio.Mesh.info`: what no other format has room for, pairs of a format and what it is."""
+"""In `meshio.Mesh.info`: what is lost when a file is written anew, pairs of the format whose writer has room
+for it (``""``: none) and what it is."""
 
 BLOCKWISE = ("abaqus:types",)
 """In `meshio.Mesh.info`: lists with an entry a cell block, beside `SECTIONS`."""

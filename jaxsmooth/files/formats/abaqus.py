@@ -9,11 +9,23 @@ from pathlib import Path
 
 import meshio
 import numpy as np
+from jaxtyping import Float
 
 from jaxsmooth.cells.table import supported
 from jaxsmooth.convert.regions import recall
-from jaxsmooth.files.formats.abaqusread import ABAQUS_TYPES, CARDS, HEADING, is_abaqus, read_abaqus
-from jaxsmooth.files.formats.record import Format, Holds
+from jaxsmooth.files.formats.abaqusread import (
+    ABAQUS_TYPES,
+    CARDS,
+    HEADING,
+    in_part,
+    is_abaqus,
+    place,
+    read_abaqus,
+    read_model,
+)
+from jaxsmooth.files.formats.cards import node_places
+from jaxsmooth.files.formats.record import Format, Holds, Patched, Source, UnpatchableError
+from jaxsmooth.files.numbers import Places, check_old, put_text
 from jaxsmooth.files.reduction import data_to_sets
 
 __all__ = ["ABAQUS", "write_abaqus"]
@@ -79,6 +91,44 @@ def _write_set(out, key: str, name: str, members: np.ndarray) -> None:
         out.write(",".join(words[k : k + 12]) + ",\n")
 
 
+def patch_abaqus(
+    source: Source, old: Float[np.ndarray, "nodes dim"], new: Float[np.ndarray, "nodes dim"]
+) -> Patched:
+    """The file with other coordinates in its node cards, those of instances in their part."""
+    model = read_model(source.content, source.path.parent)
+    if any(span is None for part in model.parts for span in part.spans):
+        raise UnpatchableError(f"its nodes are in other files ({', '.join(model.files)})")
+    check_old(np.concatenate([place(part)[0] for part in model.parts]), old, 1e-15)
+    starts, ends, before, after, at = [], [], [], [], 0
+    for part in model.parts:
+        own = np.concatenate([np.zeros((0, 3)), *part.points])
+        rows = slice(at, at + len(own))
+        at += len(own)
+        changed = new[rows] != old[rows]
+        if part.turn is not None:
+            changed |= changed.any(axis=1, keepdims=True)
+        before.append(own)
+        after.append(np.where(changed, in_part(part, new[rows].astype(np.float64)), own))
+        for span in part.spans:
+            found = node_places(source.content, *span)
+            starts.append(found.starts)
+            ends.append(found.ends)
+    places = Places(np.concatenate(starts), np.concatenate(ends))
+    content = put_text(source.content, *_once(places, np.concatenate(before), np.concatenate(after)))
+    return Patched(content, refers=tuple(name for name in model.files if not Path(name).is_absolute()))
+
+
+def _once(places: Places, old: np.ndarray, new: np.ndarray) -> tuple[Places, np.ndarray, np.ndarray]:
+    """Each node of the file once, where several instances have it; what is left out can't change."""
+    if ((places.ends == 0) & (old != new)).any():
+        raise UnpatchableError("a coordinate changes that its node card leaves out")
+    _, first, which = np.unique(places.starts.max(axis=1), return_index=True, return_inverse=True)
+    which = which.reshape(-1)
+    if np.abs(new - new[first][which]).max(initial=0) > 1e-12 * np.abs(new).max(initial=0):
+        raise UnpatchableError("a node of a *PART moves in one instance as it does not in another")
+    return Places(places.starts[first], places.ends[first]), old[first], new[first]
+
+
 ABAQUS = Format(
     "abaqus",
     (".inp",),
@@ -92,4 +142,5 @@ ABAQUS = Format(
         materials=True,
     ),
     sniff=lambda head: "" if is_abaqus(head) else None,
+    patch=patch_abaqus,
 )

@@ -17,9 +17,21 @@ import numpy as np
 
 from jaxsmooth.cells.table import element_type
 from jaxsmooth.convert.regions import SECTIONS
-from jaxsmooth.files.formats.cards import integers_of, nodes_of, read_cards, set_members
+from jaxsmooth.files.formats.cards import Card, integers_of, nodes_of, read_cards, set_members
+from jaxsmooth.files.reduction import UNKEPT
 
-__all__ = ["ABAQUS_TYPES", "CARDS", "HEADING", "is_abaqus", "read_abaqus"]
+__all__ = [
+    "ABAQUS_TYPES",
+    "CARDS",
+    "HEADING",
+    "Model",
+    "Part",
+    "in_part",
+    "is_abaqus",
+    "place",
+    "read_abaqus",
+    "read_model",
+]
 
 _SOLID = r"(?:DC|AC|F|EM|Q)?C?3D"
 _PLANE = r"(?:CPS|CPE|CPEG|CAX|CGAX|DCAX|DC2D|AC2D|ACAX|DS|M3D|R3D|SFM3D|STRI|F2D|S)"
@@ -67,14 +79,16 @@ def _meshio_type(name: str) -> str | None:
 
 
 @dataclass
-class _Part:
+class Part:
     """What stands between *PART or *INSTANCE and its end, or outside of all of them.
 
-    Sets are lists of numbers and of names of other sets; `outer` are those that the assembly gives it."""
+    Sets are lists of numbers and of names of other sets; `outer` are those that the assembly gives it.
+    `spans` are the data lines of its node cards, see `Card`."""
 
     name: str = ""
     points: list[np.ndarray] = field(default_factory=list)
     ids: list[np.ndarray] = field(default_factory=list)
+    spans: list[tuple[int, int] | None] = field(default_factory=list)
     blocks: list[tuple[str, str, np.ndarray, np.ndarray]] = field(default_factory=list)
     sets: dict[str, dict[str, list]] = field(default_factory=lambda: {"NSET": {}, "ELSET": {}})
     outer: dict[str, dict[str, list]] = field(default_factory=lambda: {"NSET": {}, "ELSET": {}})
@@ -88,17 +102,37 @@ class _Part:
         return {name.upper(): members for sets in (first, last) for name, members in sets[key].items()}
 
 
-def read_abaqus(path: Path) -> tuple[meshio.Mesh, list[str]]:
-    """Nodes, elements, sets and sections of an input file; includes are followed, instances placed.
+@dataclass(frozen=True)
+class Model:
+    """What an input file says.
 
-    Returns the mesh and notes.  Raises `ValueError` in one sentence."""
-    model, parts, instances, others = _Part(), {}, {}, set()
+    Attributes:
+        parts: its parts where their instances are, then what is outside of them.
+        heading: its first heading.
+        others: keywords that are not mesh, with their asterisk.
+        files: other files that it includes, relative to its folder.
+    """
+
+    parts: list[Part]
+    heading: str
+    others: list[str]
+    files: list[str]
+
+
+def read_model(content: bytes, folder: Path) -> Model:
+    """The model of an input file; includes are followed, instances placed.
+
+    Raises `ValueError` in one sentence."""
+    model, parts, instances, others, files = Part(), {}, {}, set(), {}
     current, heading = model, ""
-    for key, options, lines in read_cards(path):
+    for card in read_cards(content, folder):
+        key, options, lines = card.key, card.options, card.lines
+        if card.file is not None:
+            files[card.file] = True
         if key == "HEADING":
             heading = heading or " ".join(lines)
         elif key == "PART":
-            current = parts[options.get("NAME", "").upper()] = _Part()
+            current = parts[options.get("NAME", "").upper()] = Part()
         elif key == "INSTANCE":
             name, part = options.get("NAME", ""), options.get("PART", "")
             if part.upper() not in parts:
@@ -108,29 +142,37 @@ def read_abaqus(path: Path) -> tuple[meshio.Mesh, list[str]]:
             current.shift, current.turn = _placement(lines)
         elif key in ("END PART", "END INSTANCE"):
             current = model
-        elif not _read_card(current, instances, key, options, lines) and key not in _SILENT:
+        elif not _read_card(current, instances, card) and key not in _SILENT:
             others.add(f"*{key}")
     placed = [*instances.values()] if instances else [*parts.values()]
     if len(placed) > 1 and not instances:
         raise ValueError("it has more than one *PART but no *INSTANCE; write each part to a file of its own")
     placed += [model] if model.ids or not placed else []
-    mesh, notes = _assemble(placed)
+    return Model(placed, heading, sorted(others), list(files))
+
+
+def read_abaqus(path: Path) -> tuple[meshio.Mesh, list[str]]:
+    """Nodes, elements, sets and sections of an input file.
+
+    Returns the mesh and notes.  Raises `ValueError` in one sentence."""
+    model = read_model(path.read_bytes(), path.parent)
+    mesh, notes = _assemble(model.parts)
     found = f"{len(mesh.points)} nodes, {sum(map(len, mesh.cells))} elements"
-    if heading.startswith(HEADING) and heading.removeprefix(HEADING).strip() != found:
+    said = model.heading
+    if said.startswith(HEADING) and said.removeprefix(HEADING).strip() != found:
         raise ValueError(
-            f"it has {found} and says{heading.removeprefix(HEADING)}; the file is damaged or cut short"
+            f"it has {found} and says{said.removeprefix(HEADING)}; the file is damaged or cut short"
         )
-    if others:
-        named = ", ".join(sorted(others)[:4]) + (", …" if len(others) > 4 else "")
-        notes.append(
-            "only nodes, elements, sets and their sections of the Abaqus file are kept, "
-            f"not its other cards ({named})"
-        )
+    if model.others:
+        named = ", ".join(model.others[:4]) + (", …" if len(model.others) > 4 else "")
+        mesh.info[UNKEPT] = [("", f"the other cards of the Abaqus file ({named})")]
+        notes.append(f"cards of the Abaqus file that are not mesh are kept in Abaqus files only ({named})")
     return mesh, notes
 
 
-def _read_card(part: _Part, instances: dict, key: str, options: dict, lines: list[str]) -> bool:
+def _read_card(part: Part, instances: dict[str, Part], card: Card) -> bool:
     """Add what a card says to a part; False for cards that are not mesh."""
+    key, options, lines = card.key, card.options, card.lines
     if key in _MAKING or (key == "SYSTEM" and lines) or options.get("SYSTEM", "R").upper() != "R":
         raise ValueError(
             f"it has a card *{key} that Abaqus alone works out; give nodes and elements themselves"
@@ -139,6 +181,7 @@ def _read_card(part: _Part, instances: dict, key: str, options: dict, lines: lis
         number, coordinates = nodes_of(lines)
         part.points.append(coordinates)
         part.ids.append(number)
+        part.spans.append(card.span)
         if "NSET" in options:
             _add(part.sets["NSET"], options["NSET"], [number])
     elif key == "ELEMENT":
@@ -170,7 +213,7 @@ def _read_card(part: _Part, instances: dict, key: str, options: dict, lines: lis
     return True
 
 
-def _share(instances: dict[str, _Part], key: str, name: str, members: list) -> list:
+def _share(instances: dict[str, Part], key: str, name: str, members: list) -> list:
     """Give instances what a set of the assembly names of theirs; returns the other members."""
     rest = []
     for member in members:
@@ -212,7 +255,7 @@ def _placement(lines: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
     return shift, np.array(rows[1])
 
 
-def _place(part: _Part) -> tuple[np.ndarray, np.ndarray]:
+def place(part: Part) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates where the instance is, and the numbers of its nodes."""
     points = np.concatenate([np.zeros((0, 3)), *part.points])
     ids = np.concatenate([np.zeros(0, np.int64), *part.ids])
@@ -222,15 +265,27 @@ def _place(part: _Part) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"node {ids[other][0]} is given twice, at different places")
     points = points + part.shift
     if part.turn is not None:
-        origin, axis, angle = part.turn[:3], part.turn[3:6] - part.turn[:3], np.radians(part.turn[6])
-        axis = axis / np.linalg.norm(axis)
-        arm = points - origin
-        along = (arm @ axis)[:, None] * axis  # Rodrigues' formula
-        points = origin + np.cos(angle) * (arm - along) + np.sin(angle) * np.cross(axis, arm) + along
+        points = _turned(points, part.turn)
     return points, ids
 
 
-def _assemble(parts: list[_Part]) -> tuple[meshio.Mesh, list[str]]:
+def in_part(part: Part, points: np.ndarray) -> np.ndarray:
+    """Coordinates in a part of points ``[nodes, 3]`` where its instance is: `place` the other way round."""
+    if part.turn is not None:
+        points = _turned(points, np.concatenate([part.turn[:6], -part.turn[6:]]))
+    return points - part.shift
+
+
+def _turned(points: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Points turned about the axis through two points by degrees (Rodrigues' formula)."""
+    origin, axis, angle = turn[:3], turn[3:6] - turn[:3], np.radians(turn[6])
+    axis = axis / np.linalg.norm(axis)
+    arm = points - origin
+    along = (arm @ axis)[:, None] * axis
+    return origin + np.cos(angle) * (arm - along) + np.sin(angle) * np.cross(axis, arm) + along
+
+
+def _assemble(parts: list[Part]) -> tuple[meshio.Mesh, list[str]]:
     """One mesh of all parts; sets of several instances carry the instance's name."""
     points, cells, types, regions, notes = [], [], [], [], []
     point_sets: dict[str, list[np.ndarray]] = {}
@@ -239,7 +294,7 @@ def _assemble(parts: list[_Part]) -> tuple[meshio.Mesh, list[str]]:
     several = sum(bool(part.name) for part in parts) > 1
     start = 0
     for part in parts:
-        coordinates, ids = _place(part)
+        coordinates, ids = place(part)
         order = np.argsort(ids, kind="stable")
         first = len(cells)
         for name, kind, _, nodes in part.blocks:
@@ -287,12 +342,12 @@ def _meaning(key: str, options: dict[str, str], lines: list[str]) -> tuple[str, 
     )
 
 
-def _rows(part: _Part, wanted: np.ndarray) -> list[np.ndarray]:
+def _rows(part: Part, wanted: np.ndarray) -> list[np.ndarray]:
     """For every block of a part its elements with these numbers."""
     return [np.flatnonzero(np.isin(numbers, wanted)) for _, _, numbers, _ in part.blocks]
 
 
-def _sets(part: _Part, key: str, several: bool) -> Iterator[tuple[str, np.ndarray]]:
+def _sets(part: Part, key: str, several: bool) -> Iterator[tuple[str, np.ndarray]]:
     """Names and numbers of the sets of a part, then of those that the assembly gave it."""
     for name in part.sets[key]:
         yield _shown(part, key, name, several), _resolve(part.names(key), name)
@@ -300,7 +355,7 @@ def _sets(part: _Part, key: str, several: bool) -> Iterator[tuple[str, np.ndarra
         yield name, _resolve(part.names(key, outer=True), name)
 
 
-def _shown(part: _Part, key: str, name: str, several: bool) -> str:
+def _shown(part: Part, key: str, name: str, several: bool) -> str:
     """The name that a set of a part has in the mesh: sets of an assembly may have the same."""
     own = next((other for other in part.sets[key] if other.upper() == name.upper()), None)
     outer = next((other for other in part.outer[key] if other.upper() == name.upper()), None)

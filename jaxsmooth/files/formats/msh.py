@@ -1,8 +1,9 @@
 """Gmsh's .msh files where meshio (5.3.5) falls short: repairs before it reads, and a 4.1 writer.
 
 - 2.2: data of cells are split wrongly between blocks, so they are read here.
-- 4.x: nodes with parametric coordinates are refused, so those are left out.
-- 4.1: entities without a physical group beside others with one make meshio refuse the file, so
+- 4.0: its first lines say 4, which meshio takes for 4.1.
+- 4.x: nodes with parametric coordinates are refused, so those are left out; it knows no partitions.
+- 4.x: entities without a physical group beside others with one make meshio refuse the file, so
   those get the group 0, which is how meshio says "none".
 - 4.1 written by meshio can't be read again when an entity has no nodes of its own, when one has
   cells of two types, or when the source wasn't 4.1; hence the writer here.
@@ -11,6 +12,7 @@
 from __future__ import annotations
 
 import copy
+import io
 import re
 import struct
 from pathlib import Path
@@ -20,6 +22,7 @@ import numpy as np
 
 from jaxsmooth.convert.regions import GROUPS, recall
 from jaxsmooth.files.formats.mshnodes import without_parameters
+from jaxsmooth.files.formats.mshraw import Section, entities, msh_format
 from jaxsmooth.files.formats.mshtypes import CODES, in_gmsh_order
 
 __all__ = [
@@ -43,15 +46,15 @@ def sniff_msh(head: bytes) -> str | None:
 
 def repaired_msh(content: bytes) -> bytes:
     """The file as meshio can read it; the same object when there is nothing to repair."""
-    found = re.search(rb"\$MeshFormat\s+(\d)(?:\.(\d+))?\s+([01])\s+(\d+)", content[:4096])
-    if found is None:
+    if (found := msh_format(content)) is None:
         return content
-    if found[1] == b"2":
+    version, binary, size = found
+    if version.startswith("2"):
         return re.sub(rb"\$ElementData\r?\n.*?\$EndElementData[^\n]*\n?", b"", content, flags=re.DOTALL)
-    content = without_parameters(content)
-    if found[1] == b"4" and found[2] != b"0":
-        return _with_physical_groups(content, found[3] == b"1", int(found[4]))
-    return content
+    if not version.startswith("4"):
+        return content
+    content = _with_physical_groups(without_parameters(content), binary, size, version)
+    return re.sub(rb"^(\$MeshFormat\s+4)(?=\s)", rb"\1.0", content, count=1)  # 4.1 to meshio
 
 
 def read_msh_data(content: bytes, mesh: meshio.Mesh) -> dict[str, list[np.ndarray]]:
@@ -111,54 +114,29 @@ def keep_groups(mesh: meshio.Mesh, groups: dict[tuple[int, int], list[int]]) -> 
     mesh.info = {GROUPS: several}
 
 
-def _with_physical_groups(content: bytes, binary: bool, size: int) -> bytes:
+def _with_physical_groups(content: bytes, binary: bool, size: int, version: str) -> bytes:
+    """Entities of partitions among the others, and the group 0 for those without beside others with one."""
     start = content.find(b"$Entities")
     if start < 0:
         return content
-    start = content.index(b"\n", start) + 1
-    if binary:
-        body, end = _binary_entities(content, start, size)
-        end = content.index(b"$EndEntities", end)
-        return content if body is None else content[:start] + body + b"\n" + content[end:]
-    end = content.index(b"$EndEntities", start)
-    lines = [line.split() for line in content[start:end].splitlines() if line.strip()]
-    counts = [int(n) for n in lines[0]]
-    grouped = []
-    for row, fields in enumerate(lines[1:]):
-        at = 4 if row < counts[0] else 7
-        grouped.append(fields[at] != b"0")
-        if not grouped[-1]:
-            fields[at : at + 1] = [b"1", b"0"]
-    if all(grouped) or not any(grouped):
+    found = list(entities(Section(content, "Entities", binary, size), version))
+    if b"$PartitionedEntities" in content:
+        known = {(dim, tag) for dim, tag, *_ in found}
+        more = entities(Section(content, "PartitionedEntities", binary, size), version)
+        found += [one for one in more if one[:2] not in known]
+        found.sort(key=lambda one: one[:2])
+    elif len({bool(groups) for _, _, groups, _, _ in found}) < 2:
         return content
-    return content[:start] + b"\n".join(b" ".join(fields) for fields in lines) + b"\n" + content[end:]
-
-
-def _binary_entities(content: bytes, at: int, size: int) -> tuple[bytes | None, int]:
-    """The entities section with group 0 for those without; None where that isn't needed."""
-    word = {4: "<I", 8: "<Q"}[size]
-    parts, grouped = [], []
-
-    def take(length: int) -> bytes:
-        nonlocal at
-        at += length
-        return content[at - length : at]
-
-    head = take(4 * size)
-    counts = [struct.unpack_from(word, head, k * size)[0] for k in range(4)]
-    parts.append(head)
-    for dim, count in enumerate(counts):
-        for _ in range(count):
-            parts.append(take(4 + 8 * (3 if dim == 0 else 6)))
-            number = take(size)
-            groups = struct.unpack(word, number)[0]
-            grouped.append(groups > 0)
-            tags = take(4 * groups)
-            parts.append(number + tags if groups else struct.pack(word, 1) + struct.pack("<i", 0))
-            if dim:
-                number = take(size)
-                parts.append(number + take(4 * struct.unpack(word, number)[0]))
-    return (None if all(grouped) or not any(grouped) else b"".join(parts)), at
+    some = any(groups for _, _, groups, _, _ in found)
+    rows = [[("<u8" if size == 8 else "<u4", [sum(one[0] == dim for one in found) for dim in range(4)])]]
+    for dim, tag, groups, box, bounds in found:
+        groups = groups or [0] * some
+        row = [("<i4", tag), ("<f8", box), (rows[0][0][0], len(groups)), ("<i4", groups)]
+        rows.append(row + ([(rows[0][0][0], len(bounds)), ("<i4", bounds)] if dim else []))
+    out = io.BytesIO()
+    _section(out, "Entities", rows, binary)
+    end = content.index(b"$EndEntities", start) + len(b"$EndEntities")
+    return content[:start] + out.getvalue().rstrip() + content[end:]
 
 
 # --- Writing 4.1 -------------------------------------------------------------------------
@@ -221,7 +199,7 @@ def write_msh41(path: Path, mesh: meshio.Mesh, binary: bool) -> None:
     ``gmsh:geometrical``, see `split_by_entity`."""
     points = np.zeros((len(mesh.points), 3))
     points[:, : mesh.points.shape[1]] = mesh.points
-    entities = _entities(mesh, points)
+    entities = _all_entities(mesh, points)
     with open(path, "wb") as out:
         out.write(f"$MeshFormat\n4.1 {int(binary)} 8\n".encode())
         if binary:
@@ -256,7 +234,7 @@ def _section(out, name: str, rows, binary: bool) -> None:
     out.write(b"\n" * binary + f"$End{name}\n".encode())
 
 
-def _entities(mesh: meshio.Mesh, points: np.ndarray) -> dict[tuple[int, int], dict]:
+def _all_entities(mesh: meshio.Mesh, points: np.ndarray) -> dict[tuple[int, int], dict]:
     """All entities {(dim, tag): box, groups, bounds}: those of cells and those of nodes."""
     found: dict[tuple[int, int], dict] = {}
     tags = mesh.point_data.get("gmsh:dim_tags")

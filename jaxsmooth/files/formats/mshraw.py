@@ -13,7 +13,7 @@ import numpy as np
 from jaxsmooth.convert.checks import parse_numbers
 from jaxsmooth.files.formats.mshtypes import NODES_OF
 
-__all__ = ["Section", "check_msh", "entity_groups", "msh_format"]
+__all__ = ["Section", "check_msh", "entities", "entity_groups", "msh_format"]
 
 
 class Section:
@@ -60,8 +60,12 @@ _CUT = "the file is damaged or cut short"
 
 
 def msh_format(content: bytes) -> tuple[str, bool, int] | None:
+    """Version, whether it is binary, and the bytes of a size; Gmsh writes 4 for 4.0."""
     found = re.search(rb"\$MeshFormat\s+(\d(?:\.\d+)?)\s+([01])\s+(\d+)", content[:4096])
-    return None if found is None else (found[1].decode(), found[2] == b"1", int(found[3]))
+    if found is None:
+        return None
+    version = found[1].decode()
+    return "4.0" if version == "4" else version, found[2] == b"1", int(found[3])
 
 
 def check_msh(content: bytes) -> None:
@@ -182,18 +186,33 @@ def _elements4(section: Section) -> Iterator[np.ndarray]:
 
 
 def entity_groups(content: bytes) -> dict[tuple[int, int], list[int]]:
-    """The physical groups of the entities ``{(dim, tag): groups}`` of a 4.1 file."""
+    """The physical groups of a 4.x file's entities, and of their partitions ``{(dim, tag): groups}``."""
     found = msh_format(content)
-    if found is None or not found[0].startswith("4") or found[0] == "4.0" or b"$Entities" not in content:
+    if found is None or not found[0].startswith("4"):
         return {}
-    section = Section(content, "Entities", found[1], found[2])
     groups = {}
+    for name in ("Entities", "PartitionedEntities"):
+        if b"$" + name.encode() in content:
+            for dim, tag, own, _, _ in entities(Section(content, name, found[1], found[2]), found[0]):
+                groups[dim, tag] = own
+    return groups
+
+
+def entities(section: Section, version: str) -> Iterator[tuple[int, int, list[int], np.ndarray, list[int]]]:
+    """Dimension, tag, physical groups, box and bounding entities of the entities of a file of version 4."""
+    parts = section.name == "PartitionedEntities"
+    if parts:
+        section.take(1, "n")
+        ghosts = section.take(1, "n")[0]
+        section.take(2 * ghosts)
     for dim, count in enumerate(section.take(4, "n")):
         for _ in range(count):
             tag = int(section.take(1)[0])
-            section.take(6 if dim else 3, "d")
-            groups[dim, tag] = [int(g) for g in section.take(int(section.take(1, "n")[0]))]
-            if dim:
-                section.take(int(section.take(1, "n")[0]))
+            if parts:
+                section.take(2)  # the entity it is a part of
+                section.take(section.take(1, "n")[0])
+            box = section.take(6 if dim or version == "4.0" else 3, "d")
+            groups = [int(g) for g in section.take(section.take(1, "n")[0])]
+            bounds = [int(b) for b in section.take(section.take(1, "n")[0])] if dim else []
+            yield dim, tag, groups, box, bounds
     section.end()
-    return groups

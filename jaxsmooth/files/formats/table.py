@@ -25,6 +25,7 @@ from jaxsmooth.files.formats.rare import RARE
 from jaxsmooth.files.formats.record import Format, stem_format
 from jaxsmooth.files.formats.su2 import SU2
 from jaxsmooth.files.formats.ugrid import UGRID
+from jaxsmooth.files.formats.unv import UNV
 from jaxsmooth.files.formats.vtk import VTK, VTK42
 from jaxsmooth.files.formats.vtu import VTU
 from jaxsmooth.files.formats.xdmf import XDMF
@@ -46,7 +47,7 @@ def register(format: Format) -> None:
 
 
 for _format in (
-    *(GMSH22, GMSH, VTU, VTK, VTK42, XDMF, ABAQUS, MEDIT, SU2, EXODUS, MED, NASTRAN, UGRID, NPZ),
+    *(GMSH22, GMSH, VTU, VTK, VTK42, XDMF, ABAQUS, MEDIT, SU2, EXODUS, MED, NASTRAN, UNV, UGRID, NPZ),
     *RARE,
 ):
     register(_format)

@@ -9,9 +9,11 @@ import meshio
 import numpy as np
 from jaxtyping import Float
 
+from jaxsmooth.files.formats.meshios import read_copy
 from jaxsmooth.files.formats.record import Format, Holds, Patched, Source
 from jaxsmooth.files.formats.vtk import pad_pairs
 from jaxsmooth.files.formats.vtuarrays import replace_points
+from jaxsmooth.files.reduction import UNKEPT
 
 __all__ = ["VTU", "check_vtu", "read_vtu", "write_vtu"]
 
@@ -19,10 +21,47 @@ _CUT = "the file is damaged or cut short"
 
 
 def read_vtu(path: Path) -> tuple[meshio.Mesh, list[str]]:
-    """A file of one grid, in one piece or several."""
-    mesh = meshio.read(path, file_format="vtu")
-    check_vtu(path.read_bytes(), mesh)
-    return mesh, []
+    """A file of one grid; text and bits among its data are left out, for meshio does not know them."""
+    content = path.read_bytes()
+    repaired, names = _without_text(content)
+    mesh = read_copy(repaired, path, "vtu") if names else meshio.read(path, file_format="vtu")
+    check_vtu(content, mesh)
+    if not names:
+        return mesh, []
+    mesh.field_data = {key: v for key, v in mesh.field_data.items() if not key.startswith(_TEXT)}
+    mesh.info = {UNKEPT: [("", f"data of text or bits ({', '.join(names)})")]}
+    return mesh, [f"data of text or bits are kept in VTU files only ({', '.join(names)})"]
+
+
+_TEXT = "jaxsmooth:text"
+
+
+def _without_text(content: bytes) -> tuple[bytes, list[str]]:
+    """The file with arrays of text and bits as bytes among the data of no node or cell; their names.
+
+    They can't be taken out: meshio finds raw data by looking from one array to the next."""
+    end = content.find(b"<AppendedData")
+    head = content if end < 0 else content[:end]
+    arrays, names = [], []
+
+    def taken(found: re.Match) -> bytes:
+        own = found[2]
+        name = re.search(rb"\bName\s*=\s*[\"']([^\"']*)", own)
+        names.append(name[1].decode(errors="replace") if name else "")
+        own = re.sub(rb"\b(?:type|Name|NumberOfComponents|NumberOfTuples)\s*=\s*[\"'][^\"']*[\"']", b"", own)
+        opening = b'<DataArray type="Int8" Name="%s %d" ' % (_TEXT.encode(), len(arrays))
+        arrays.append(opening + own + b">" + (found[3] or b"") + b"</DataArray>\n")
+        return b""
+
+    pattern = rb"<(Array|DataArray)\b([^>]*\btype\s*=\s*[\"'](?:String|Bit)[\"'][^>]*?)(?:/>|>(.*?)</\1>)"
+    head = re.sub(pattern, taken, head, flags=re.DOTALL)
+    grid = re.search(rb"<UnstructuredGrid\b[^>]*>", head)
+    if not names or grid is None:
+        return content, []
+    fields = b"<FieldData>\n" + b"".join(arrays) + b"</FieldData>\n"
+    return head[: grid.end()] + fields + head[grid.end() :] + content[
+        len(content) if end < 0 else end :
+    ], names
 
 
 def check_vtu(content: bytes, mesh: meshio.Mesh) -> None:

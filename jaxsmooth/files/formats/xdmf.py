@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxsmooth.cells.table import TYPES, element_type
 from jaxsmooth.files.formats.record import Format, Holds
+from jaxsmooth.files.formats.xdmfgrids import only_grid, patch_xdmf
 
 __all__ = ["XDMF", "read_xdmf", "write_xdmf"]
 
@@ -22,6 +23,7 @@ def read_xdmf(path: Path) -> tuple[meshio.Mesh, list[str]]:
 
     root = ElementTree.parse(path).getroot()
     reader = XdmfReader(str(path))
+    notes = only_grid(root)
     for grid in root.iter("Grid"):
         for topology in grid.findall("Topology"):
             kind = topology.get("Type", topology.get("TopologyType"))
@@ -41,7 +43,7 @@ def read_xdmf(path: Path) -> tuple[meshio.Mesh, list[str]]:
                 at += 1
     version = root.attrib.get("Version", "3")
     read = reader.read_xdmf2 if version.startswith("2") else reader.read_xdmf3
-    return read(root), []
+    return read(root), notes
 
 
 def _split_mixed(numbers: np.ndarray, types: dict[int, str]) -> Iterator[tuple[str, np.ndarray]]:
@@ -75,5 +77,11 @@ def _wide(values: np.ndarray) -> np.ndarray:
 
 
 XDMF = Format(
-    "xdmf", (".xdmf", ".xmf"), read_xdmf, write_xdmf, Holds(any_data=True, space=True), needs="h5py"
+    "xdmf",
+    (".xdmf", ".xmf"),
+    read_xdmf,
+    write_xdmf,
+    Holds(any_data=True, space=True),
+    needs="h5py",
+    patch=patch_xdmf,
 )
