@@ -16,6 +16,8 @@ import jaxsmooth.files.io as jsio
 from jaxsmooth.cells.table import element_type, supported
 from jaxsmooth.convert.meshfile import from_meshio
 from jaxsmooth.files.formats.exodus import EXODUS_ORDER, extend_exodus
+from jaxsmooth.files.formats.mshtypes import in_gmsh_order
+from jaxsmooth.files.formats.table import FORMATS
 from jaxsmooth.files.io import MeshFileError, check_output, read, write
 
 needs_h5py = pytest.mark.skipif(importlib.util.find_spec("h5py") is None, reason="needs h5py")
@@ -142,6 +144,29 @@ def test_formats_of_linear_elements(tmp_path, name, suffix):
     if suffix != "su2":
         assert np.array_equal(again.source.cell_data["medit:ref"][0], [4, 4, 4])
         assert np.array_equal(again.mesh.labels.regions[0], [4, 4, 4])
+
+
+@pytest.mark.parametrize("name", [n for n in ALL if n in FORMATS["unv"].holds.types])
+def test_universal_files(tmp_path, name):
+    source = sample(name)
+    source.cell_data = {"material": [np.array([4, 5, 4])]}
+    source.point_sets = {"support": np.array([0, 2])}
+    source.cell_sets = {"steel": [np.array([0, 2])]}
+    file, again, notes = round_trip(tmp_path, source, "a.unv")
+    assert "not written: u, v" in notes[0]
+    assert list(again.mesh.labels.regions[0]) == [4, 5, 4]
+    for key in ("support", "steel"):
+        assert np.array_equal(again.named_sets[key], file.named_sets[key])
+    gmsh = pytest.importorskip("gmsh")
+    gmsh.initialize(interruptible=False)
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.merge(str(tmp_path / "a.unv"))
+        _, _, (nodes,) = gmsh.model.mesh.getElements()
+        expected = in_gmsh_order(name, source.cells[0].data) + 1
+        assert sorted(nodes.reshape(expected.shape).tolist()) == sorted(expected.tolist())
+    finally:
+        gmsh.finalize()
 
 
 @needs_netcdf

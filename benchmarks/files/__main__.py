@@ -29,11 +29,11 @@ TABLE = Path(__file__).parents[1] / "FILES.md"
 
 HEAD = """# Files in, files out
 
-Made by `python -m benchmarks.files`.  A third of the nodes of each file is moved (held ones are not), and the file
-written in its own format.  *Bytes*: whether everything but the coordinates is the same, byte by byte (where
-compressed blocks or names of companions differ in length: array by array).  *Error*: the largest difference between
-coordinates that were asked for and those read again, relative to the largest coordinate.  *Opened by*: programs
-other than jaxsmooth that read the output and find these coordinates.
+Made by `python -m benchmarks.files --large FILE FOLDER …`.  A third of the nodes of each file is moved, but
+for held ones, and it is written in its own format.  *Bytes*: whether everything but the coordinates is the
+same, byte by byte (array by array where compressed blocks differ in length).  *Error*: the largest difference
+between coordinates that were asked for and those read again, relative to the largest coordinate.  *Opened
+by*: programs other than jaxsmooth that read the output and find these coordinates.
 """
 
 

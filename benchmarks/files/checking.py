@@ -1,4 +1,4 @@
-"""What becomes of a file when it is written with other coordinates: compared with the input, and by others."""
+"""What becomes of a file that is written with other coordinates: compared with it, and read by others."""
 
 from __future__ import annotations
 

@@ -90,7 +90,14 @@ def _check(
             link = Path(os.path.normpath(path.parent / name))
             link.parent.mkdir(parents=True, exist_ok=True)
             link.symlink_to((source.path.parent / name).resolve())
-        again = record.read(path)[0]
+        try:
+            again = record.read(path)[0]
+        except MemoryError:
+            raise
+        except (Exception, SystemExit) as error:  # meshio's readers raise anything, and exit
+            raise UnpatchableError(
+                f"the copy can't be read ({' '.join(str(error).split())[:200]})"
+            ) from error
     found = plain(again.points)
     size = np.abs(new).max(initial=0.0)
     same = found.shape == new.shape and np.abs(found - new).max(initial=0.0) <= patched.precision * size

@@ -1,0 +1,410 @@
+"""What goes in comes out: output in the input's format is the input with other coordinates in it."""
+
+import dataclasses
+import os
+import re
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+
+import jaxsmooth as js
+from benchmarks.files.checking import check, moved
+from benchmarks.files.making import ABAQUS, MAKERS, make
+from jaxsmooth.convert import original
+from jaxsmooth.files.formats.nastran import _fitted, _number
+from jaxsmooth.files.formats.record import Patched, UnpatchableError
+from jaxsmooth.files.formats.table import FORMATS, register
+from jaxsmooth.files.io import MeshFileError
+from jaxsmooth.files.numbers import Places, put_text, tokens
+
+DATA = Path(__file__).parent / "data"
+ANEW = "is written anew"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Makes each file once."""
+    folder, paths = tmp_path_factory.mktemp("made"), {}
+
+    def get(name):
+        if name not in paths:
+            paths[name] = make(name, folder)
+        if paths[name] is None:
+            pytest.skip("a package to make the file is missing")
+        return paths[name]
+
+    return get
+
+
+# --- Every format ------------------------------------------------------------------------
+
+ERROR = {"gmsh.bdf": 1e-6, "hand-fields.nas": 1e-7, "vtk-raw-float32.vtu": 6e-8, "vtk-legacy-4.2.vtk": 6e-8}
+NOTES = {"hand-fields.nas": "fields of 8 columns round", "gmsh.bdf": "fields of 8 columns round"}
+NOTES |= {f"gmsh-4.1-parametric-{mode}.msh": "80 nodes that move are kept" for mode in ("ascii", "binary")}
+ALONE = {"hand-assembly.inp", "hand-crlf.inp", "meshio-series.xdmf"}  # others know no instances, no time
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_only_coordinates_change(made, tmp_path, name):
+    row = check(made(name), tmp_path)
+    assert row.same
+    assert row.error <= ERROR.get(name, 1e-15)
+    assert bool(row.readers) == (name not in ALONE)
+    if name in NOTES:
+        assert NOTES[name] in row.notes[0]
+    assert len(row.notes) == (name in NOTES)
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_without_other_coordinates_it_is_the_same_file(made, tmp_path, name):
+    path, output = made(name), tmp_path / name
+    js.write(output, js.read(path))
+    assert output.read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    "name", ["gmsh-2.2-ascii.msh", "gmsh-4.1-ascii.msh", "gmsh.inp", "gmsh.mesh", "gmsh.su2"]
+)
+def test_nodes_that_stay_keep_their_lines(made, tmp_path, name):
+    file = js.read(made(name))
+    points = moved(file)
+    js.write(tmp_path / name, file, points)
+    lines = [path.read_bytes().splitlines() for path in (made(name), tmp_path / name)]
+    differ = sum(one != other for one, other in zip(*lines, strict=True))
+    assert differ == (points != np.asarray(file.mesh.points)).any(axis=1).sum() > 0
+
+
+@pytest.mark.parametrize(
+    "name", [*sorted(path.name for path in DATA.glob("*.msh")), "ffd.su2", "16_onlycore.inp"]
+)
+def test_files_that_went_wrong_elsewhere(tmp_path, name):
+    row = check(DATA / name, tmp_path)
+    assert (row.same, row.error, row.notes) == (True, 0, ())
+
+
+# --- Numbers in text -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "value", "expected"),
+    [
+        ("0.5 1 2", 0.1, "0.1 1 2"),
+        ("0.5 1 2", 1 / 3, "0.3333333333333333 1 2"),
+        ("5e-1 1e0 2e0", 1 / 3, "3.3333333333333331e-01 1e0 2e0"),
+        ("5E-01 1E+00 2E+00", 0.25, "2.5000000000000000E-01 1E+00 2E+00"),
+        ("5.D-001 1.D+000 2.D+000", -0.25, "-2.5000000000000000D-001 1.D+000 2.D+000"),
+        ("0.500 1.000 2.000", 0.25, "0.250 1.000 2.000"),
+        ("0.500 1.000 2.000", 1e-7, "1e-07 1.000 2.000"),
+        ("   0.500    1.000    2.000", 0.25, "   0.250    1.000    2.000"),
+        ("   0.500    1.000    2.000", -0.25, "  -0.250    1.000    2.000"),
+        ("       0.50000   1.00000", 0.123456789, "   0.123456789   1.00000"),
+        ("  -0.500    1.000    2.000", 0.25, "   0.250    1.000    2.000"),
+        ("-0.5 1 2", 0.25, "0.25 1 2"),
+    ],
+)
+def test_numbers_are_written_as_their_neighbours(text, value, expected):
+    content = text.encode()
+    starts, ends = tokens(content)
+    old = np.array([[float(content[s:e].replace(b"D", b"e")) for s, e in zip(starts, ends, strict=True)]])
+    new = old.copy()
+    new[0, 0] = value
+    assert put_text(content, Places(starts[None], ends[None]), old, new).decode() == expected
+
+
+@pytest.mark.parametrize("form", ["%r", "%.16e", "%.8f", "%22.14E", "%g"])
+def test_numbers_are_exact_and_others_stay(form):
+    random = np.random.default_rng(0)
+    words = [form % value for value in (random.normal(size=90) * 10.0 ** random.integers(-9, 9, 90)).tolist()]
+    content = " ".join(words).encode()
+    starts, ends = tokens(content)
+    places = Places(starts.reshape(30, 3), ends.reshape(30, 3))
+    old = np.array(words, float).reshape(30, 3)
+    new = np.where(random.random(old.shape) < 0.5, old, random.normal(size=old.shape))
+    again = put_text(content, places, old, new)
+    found = again.decode().split()
+    assert np.array_equal(np.array(found, float).reshape(30, 3), new)
+    kept = np.flatnonzero((old == new).ravel())
+    assert [found[k] for k in kept] == [words[k].strip() for k in kept]
+    with pytest.raises(UnpatchableError, match=r"node 7 .* not where they should be"):
+        put_text(content, places, old + (np.arange(30) == 7)[:, None], new)
+
+
+@pytest.mark.parametrize("width", [8, 16])
+def test_narrow_fields_have_the_digits_that_fit(width):
+    """No text of so many columns is nearer: half a unit of the last digit that has room."""
+    random = np.random.default_rng(1)
+    for value in (random.choice([-1, 1], 400) * 10 ** random.uniform(-12, 12, 400)).tolist():
+        word = _fitted(value, width)
+        assert len(word) <= width
+        power = int(np.floor(np.log10(abs(value))))
+        exponent = len(f"{power:+d}")  # columns for it, or for the zeros that it saves
+        room = width - 1 - (value < 0) - (0 if 0 <= power < width - 2 else exponent)
+        digits = max(room - (max(0, -1 - power) if -4 < power < 0 else 0), room - exponent, 1)
+        assert abs(_number(word) - value) <= 0.51 * 10.0 ** (power - digits + 1)
+    assert _fitted(0.123456789, 8) == b".1234568"
+    assert _fitted(-1.5e-5, 8) == b"-1.5-5"
+
+
+# --- What the file was, and what became of it ---------------------------------------------
+
+
+def test_the_input_may_be_the_output(made, tmp_path):
+    path = tmp_path / "a.msh"
+    path.write_bytes(made("gmsh-4.1-ascii.msh").read_bytes())
+    file = js.read(path)
+    points = moved(file)
+    assert js.write(path, file, points, force=True) == ()
+    assert np.array_equal(js.read(path).mesh.points, points)
+    assert js.write(path, file, force=True) == ()  # the bytes are still known
+    assert path.read_bytes() == made("gmsh-4.1-ascii.msh").read_bytes()
+
+
+def test_large_files_are_read_again_if_they_are_the_same(made, tmp_path, monkeypatch):
+    monkeypatch.setattr(original, "KEPT", 1000)
+    path, output = tmp_path / "a.msh", tmp_path / "b.msh"
+    path.write_bytes(made("gmsh-4.1-ascii.msh").read_bytes())
+    file = js.read(path)
+    assert file.original.content is None
+    points = moved(file)
+    assert js.write(output, file, points) == ()
+    path.write_bytes(path.read_bytes() + b"$Comments\n$EndComments\n")
+    for change in (lambda: None, path.unlink):
+        change()
+        (note,) = js.write(output, file, points)
+        assert ANEW in note
+        assert "the input is gone, or was changed after it had been read" in note
+        assert np.array_equal(js.read(output).mesh.points, points)
+
+
+def test_arrays_that_users_add_are_written(made, tmp_path):
+    file = js.read(made("meshio-zlib.vtu"))
+    file.source.point_data["mine"] = np.arange(64.0)
+    js.write(tmp_path / "a.vtu", file)
+    assert np.array_equal(js.read(tmp_path / "a.vtu").source.point_data["mine"], np.arange(64.0))
+    file = js.read(made("meshio-zlib.vtu"))
+    js.write(tmp_path / "b.vtu", file, cell_data={"q": {"hexahedron": np.arange(27.0)}})
+    assert "q" in js.read(tmp_path / "b.vtu").source.cell_data
+
+
+@pytest.fixture
+def table():
+    before = dict(FORMATS)
+    yield FORMATS
+    FORMATS.update(before)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (
+            lambda content: re.sub(rb"0(\.\d+ \S+ \S+\s*\$EndNodes)", rb"1\1", content),
+            "its coordinates are others",
+        ),
+        (lambda content: content.replace(b"$Elements\n", b"$Elements", 1), "the copy can't be read"),
+        (
+            lambda content: re.sub(
+                rb"(\n\d+ )(\d+) (\d+) (\d+)(?= *\n\$EndElements)", rb"\1\3 \2 \4", content
+            ),
+            "its cells",
+        ),
+    ],
+)
+def test_a_copy_that_is_not_right_is_not_used(made, tmp_path, table, change, reason):
+    """The last case turns the last triangle round."""
+    right = FORMATS["gmsh"]
+
+    def wrong(source, old, new):
+        content = right.patch(source, old, new).content
+        assert change(content) != content
+        return Patched(change(content))
+
+    file = js.read(made("gmsh-4.1-plane.msh"))
+    register(dataclasses.replace(right, patch=wrong))
+    points = moved(file)
+    (note,) = js.write(tmp_path / "a.msh", file, points)
+    assert ANEW in note
+    assert reason in note
+    assert np.array_equal(js.read(tmp_path / "a.msh").mesh.points, points)
+
+
+def test_errors_of_the_program_are_not_hidden(made, tmp_path, table):
+    def broken(source, old, new):
+        raise TypeError("a bug")
+
+    register(dataclasses.replace(FORMATS["vtu"], patch=broken))
+    with pytest.raises(TypeError, match="a bug"):
+        js.write(tmp_path / "a.vtu", js.read(made("meshio-zlib.vtu")))
+
+
+def test_the_command_line_copies_too(tmp_path, capsys):
+    from jaxsmooth.cli import main
+
+    for name in ("16_onlycore.inp", "ffd.su2", "rect41.msh"):
+        output = tmp_path / name
+        assert main(["smooth", str(DATA / name), str(output), "--steps", "0"]) in (0, 3)  # some are inverted
+        assert output.read_bytes() == (DATA / name).read_bytes()
+
+
+# --- Single formats ------------------------------------------------------------------------
+
+
+def test_an_instance_moves_in_its_part(tmp_path):
+    (tmp_path / "a.inp").write_text(ABAQUS)
+    file = js.read(tmp_path / "a.inp")
+    points = np.array(file.mesh.points)
+    points[1] += [0.1, 0.2]
+    assert js.write(tmp_path / "b.inp", file, points) == ()
+    again = js.read(tmp_path / "b.inp")
+    assert np.allclose(again.mesh.points, points, rtol=0, atol=1e-15)
+    line = (tmp_path / "b.inp").read_text().splitlines()[6]
+    turn = np.radians(-30)
+    expected = [1 + 0.1 * np.cos(turn) - 0.2 * np.sin(turn), 0.1 * np.sin(turn) + 0.2 * np.cos(turn)]
+    assert np.allclose([float(word) for word in line.split(",")[1:3]], expected, rtol=0, atol=1e-15)
+
+
+def test_a_part_in_two_places_moves_in_both_or_not_at_all(tmp_path):
+    second = "*INSTANCE, NAME=I2, PART=BLADE\n 9., 0., 0.\n*END INSTANCE\n*SURFACE"
+    (tmp_path / "a.inp").write_text(
+        ABAQUS.replace(" 3., 0., 0., 3., 0., 1., 30.\n", "").replace("*SURFACE", second)
+    )
+    file = js.read(tmp_path / "a.inp")
+    points = np.array(file.mesh.points)
+    assert len(points) == 8
+    points[[1, 5]] += 0.125
+    assert js.write(tmp_path / "b.inp", file, points) == ()
+    assert np.array_equal(js.read(tmp_path / "b.inp").mesh.points, points)
+    points[1] += 0.125
+    (note, *_) = js.write(tmp_path / "b.inp", file, points)
+    assert "moves in one instance as it does not in another" in note
+    assert np.array_equal(js.read(tmp_path / "b.inp").mesh.points, points)
+
+
+FLAT = "*NODE\n1, 0., 0.\n2, 1., 0.\n3, 1., 1.\n4, 0., 1.\n5, .4, .6\n"
+PLATE = "*ELEMENT, TYPE=CPS3\n1, 1, 2, 5\n2, 2, 3, 5\n3, 3, 4, 5\n4, 4, 1, 5\n"
+
+
+def test_included_files_stay_where_they_are(tmp_path):
+    (tmp_path / "steel.txt").write_text("*MATERIAL, NAME=STEEL\n")
+    (tmp_path / "part").mkdir()
+    (tmp_path / "part" / "a.inp").write_text(FLAT + PLATE + "*INCLUDE, INPUT=../steel.txt\n")
+    file = js.read(tmp_path / "part" / "a.inp")
+    points = moved(file)
+    assert js.write(tmp_path / "part" / "b.inp", file, points) == ()
+    assert np.array_equal(js.read(tmp_path / "part" / "b.inp").mesh.points, points)
+    assert (tmp_path / "part" / "b.inp").read_text().endswith("*INCLUDE, INPUT=../steel.txt\n")
+    (tmp_path / "out").mkdir()
+    (note,) = js.write(tmp_path / "out" / "b.inp", file, points)
+    assert "b.inp refers to ../steel.txt beside it; copy from" in note
+    assert sorted(os.listdir(tmp_path)) == ["out", "part", "steel.txt"]
+
+
+@pytest.mark.parametrize("card", ["*INCLUDE, INPUT=nodes.txt\n", "*NODE, INPUT=nodes.txt\n"])
+def test_nodes_in_an_included_file(tmp_path, card):
+    (tmp_path / "nodes.txt").write_text(FLAT if "INCLUDE" in card else FLAT.removeprefix("*NODE\n"))
+    (tmp_path / "a.inp").write_text(card + PLATE)
+    file = js.read(tmp_path / "a.inp")
+    (note, *_) = js.write(tmp_path / "b.inp", file, moved(file))
+    assert (
+        "because the input can't be copied with other coordinates: its nodes are in other files (nodes.txt)"
+        in note
+    )
+    assert np.array_equal(js.read(tmp_path / "b.inp").mesh.points, moved(file))
+
+
+def test_cards_that_are_lost_are_said(tmp_path):
+    (tmp_path / "a.inp").write_text(FLAT + PLATE + "*STEP\n*STATIC\n*END STEP\n")
+    file = js.read(tmp_path / "a.inp")
+    kept = "cards of the Abaqus file that are not mesh are kept in Abaqus files only"
+    assert file.notes == (f"{kept} (*END STEP, *STATIC, *STEP)",)
+    lost = "no place for the other cards of the Abaqus file (*END STEP, *STATIC, *STEP); they are not written"
+    assert lost in js.write(tmp_path / "b.vtu", file)[0]
+    assert lost in js.write(tmp_path / "b.inp", dataclasses.replace(file, original=None))[0]
+
+
+def test_files_beside_an_xdmf_file(made, tmp_path):
+    pytest.importorskip("h5py")
+    for name in ("meshio-hdf5.xdmf", "meshio-hdf5.h5"):
+        (tmp_path / name).write_bytes((made("meshio-hdf5.xdmf").parent / name).read_bytes())
+    path = tmp_path / "meshio-hdf5.xdmf"
+    before = (tmp_path / "meshio-hdf5.h5").read_bytes()
+    file = js.read(path)
+    points = moved(file)
+    assert js.write(tmp_path / "b.xdmf", file, points) == ()
+    assert sorted(os.listdir(tmp_path)) == ["b.h5", "b.xdmf", "meshio-hdf5.h5", "meshio-hdf5.xdmf"]
+    assert (tmp_path / "meshio-hdf5.h5").read_bytes() == before
+    path.rename(tmp_path / "hidden.xdmf")
+    os.remove(tmp_path / "meshio-hdf5.h5")
+    assert np.array_equal(js.read(tmp_path / "b.xdmf").mesh.points, points)
+    assert np.array_equal(meshio.read(tmp_path / "b.xdmf").points, points)
+    (tmp_path / "c.h5").write_bytes(b"precious")
+    with pytest.raises(MeshFileError, match=r"c\.h5: .*would be replaced"):
+        js.write(tmp_path / "c.xdmf", js.read(tmp_path / "b.xdmf"))
+    assert (tmp_path / "c.h5").read_bytes() == b"precious"
+    again = js.read(tmp_path / "b.xdmf")
+    assert js.write(tmp_path / "b.xdmf", again, np.asarray(file.mesh.points), force=True) == ()
+    assert np.array_equal(js.read(tmp_path / "b.xdmf").mesh.points, file.mesh.points)
+    (tmp_path / "b.h5").unlink()
+    (note,) = js.write(tmp_path / "d.xdmf", again)
+    assert ANEW in note
+
+
+def test_the_grids_of_a_series(made, tmp_path):
+    pytest.importorskip("h5py")
+    path = made("meshio-series.xdmf")
+    file = js.read(path)
+    assert "first grid of the XDMF file (mesh)" in file.notes[0]
+    js.write(tmp_path / "a.xdmf", file, moved(file))
+    with meshio.xdmf.TimeSeriesReader(tmp_path / "a.xdmf") as reader:
+        points, _ = reader.read_points_cells()
+        assert reader.num_steps == 3
+        time, data, _ = reader.read_data(1)
+    assert np.array_equal(points, moved(file))
+    assert time == 0.5
+    assert np.array_equal(data["heat"], 0.5 * np.asarray(file.source.points)[:, 0])
+
+
+def test_text_of_vtk_survives(made, tmp_path):
+    vtk = pytest.importorskip("vtk")
+    for name in ("vtk-ascii.vtu", "vtk-raw-zlib.vtu", "vtk-appended-base64.vtu"):
+        file = js.read(made(name))
+        assert file.notes[0] == "data of text or bits are kept in VTU files only (label, flag)"
+        assert list(file.source.point_data) == ["heat", "flow"]
+        js.write(tmp_path / name, file, moved(file))
+        reader = vtk.vtkXMLUnstructuredGridReader()
+        reader.SetFileName(str(tmp_path / name))
+        reader.Update()
+        data = reader.GetOutput().GetCellData()
+        assert data.GetAbstractArray("label").GetValue(35) == "cell 35"
+        assert [data.GetArray("flag").GetValue(k) for k in range(4)] == [0, 1, 0, 1]
+        assert reader.GetOutput().GetFieldData().GetArray("TimeValue").GetValue(0) == 0.25
+        assert "data of text or bits (label, flag)" in js.write(tmp_path / "a.msh", file)[0]
+
+
+def test_versions_of_gmsh_say_the_same(made):
+    files = [js.read(made(f"gmsh-{name}.msh")) for name in ("4.1-ascii", "4.0-ascii", "4.1-parametric-ascii")]
+    files.append(js.read(made("gmsh-4.1-parametric-binary.msh")))
+    for file in files[1:]:
+        assert np.allclose(file.mesh.points, files[0].mesh.points, rtol=0, atol=1e-15)  # 16 digits
+        assert np.array_equal(file.mesh.connectivity[0], files[0].mesh.connectivity[0])
+        assert np.array_equal(file.mesh.labels.regions[0], files[0].mesh.labels.regions[0])
+
+
+def test_partitions_of_gmsh(made):
+    """Nodes and elements are in another order; the groups are those of the entities they are parts of."""
+    whole, parts = (js.read(made(f"gmsh-4.1-{name}.msh")) for name in ("ascii", "partitioned"))
+    assert len(parts.mesh.points) == len(whole.mesh.points)
+    for name in ("material 0", "material 1", "left"):
+        assert parts.named_sets[name].sum() == whole.named_sets[name].sum() > 0
+
+
+def test_a_plane_mesh_with_its_plane_in_space(made, tmp_path):
+    """Two coordinates change, the third keeps its text."""
+    file = js.read(made("gmsh-plane.su2"))
+    js.write(tmp_path / "a.msh", file, file_format="gmsh22:ascii")
+    text = re.sub(r"(?m)^(\d+ \S+ \S+) \S+$", r"\1 0.250", (tmp_path / "a.msh").read_text())
+    (tmp_path / "a.msh").write_text(text)
+    file = js.read(tmp_path / "a.msh")
+    assert js.write(tmp_path / "b.msh", file, moved(file)) == ()
+    assert (tmp_path / "b.msh").read_text().count(" 0.250\n") == len(file.mesh.points)
