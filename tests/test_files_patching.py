@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxsmooth as js
-from benchmarks.files.checking import check, moved
+from benchmarks.files.checking import check, moved, same_beside
 from benchmarks.files.making import ABAQUS, MAKERS, make
 from jaxsmooth.convert import original
 from jaxsmooth.files.formats.nastran import _fitted, _number
@@ -43,7 +43,12 @@ def made(tmp_path_factory):
 ERROR = {"gmsh.bdf": 1e-6, "hand-fields.nas": 1e-7, "vtk-raw-float32.vtu": 6e-8, "vtk-legacy-4.2.vtk": 6e-8}
 NOTES = {"hand-fields.nas": "fields of 8 columns round", "gmsh.bdf": "fields of 8 columns round"}
 NOTES |= {f"gmsh-4.1-parametric-{mode}.msh": "80 nodes that move are kept" for mode in ("ascii", "binary")}
-ALONE = {"hand-assembly.inp", "hand-crlf.inp", "meshio-series.xdmf"}  # others know no instances, no time
+ALONE = {
+    "numpy.npz",
+    "hand-assembly.inp",
+    "hand-crlf.inp",
+    "meshio-series.xdmf",
+}  # others know no instances, no time
 
 
 @pytest.mark.parametrize("name", MAKERS)
@@ -61,7 +66,12 @@ def test_only_coordinates_change(made, tmp_path, name):
 def test_without_other_coordinates_it_is_the_same_file(made, tmp_path, name):
     path, output = made(name), tmp_path / name
     js.write(output, js.read(path))
-    assert output.read_bytes() == path.read_bytes()
+    if path.suffix == ".npz":  # it tells the time
+        one, other = (dict(np.load(p)) for p in (path, output))
+        assert one.keys() == other.keys()
+        assert all(np.array_equal(one[key], other[key]) for key in one)
+    else:
+        assert output.read_bytes() == path.read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -408,3 +418,128 @@ def test_a_plane_mesh_with_its_plane_in_space(made, tmp_path):
     file = js.read(tmp_path / "a.msh")
     assert js.write(tmp_path / "b.msh", file, moved(file)) == ()
     assert (tmp_path / "b.msh").read_text().count(" 0.250\n") == len(file.mesh.points)
+
+
+# --- Odd layouts ---------------------------------------------------------------------------
+
+MSH = """$Comments
+nobody's $Nodes
+$EndComments
+$MeshFormat
+2.2 0 8
+$EndMeshFormat
+$Nodes
+5
+7 0 0 0
+3 1 0 0
+99 1 1 0
+1 0 1 0
+50 .4 .6 0
+$EndNodes
+$Elements
+4
+1 2 2 1 1 7 3 50
+2 2 2 1 1 3 99 50
+3 2 2 1 1 99 1 50
+9 2 2 1 1 1 7 50
+$EndElements
+"""
+SU2 = """% first
+NDIME= 2 % two
+NELEM=4
+5 0 1 4
+5 1 2 4
+5 2 3 4
+5 3 0 4
+NPOIN=5 5 % nodes
+0 0 0 % corner
+
+1 0 1
+1\t1 2
+0 1 3
+4e-1 6e-1 4
+NMARK=1
+MARKER_TAG= w
+MARKER_ELEMS= 1
+3 0 1
+"""
+NODES_LAST = """NDIME=2
+NELEM= 4
+5 0 1 4
+5 1 2 4
+5 2 3 4
+5 3 0 4
+NMARK= 0
+NPOIN= 5
+0 0
+1 0
+1 1
+0 1
+.4 .6
+"""
+MEDIT = """MeshVersionFormatted 2 Dimension 2 Vertices 5 0 0 1 1 0 1 1 1 1
+0 1 1 .4 .6 2 # end
+Triangles 4 1 2 5 1 2 3 5 1 3 4 5 2 4 1 5 2 RequiredVertices 1 1 End
+"""
+VTK = """# vtk DataFile Version 3.0
+x
+ASCII
+DATASET UNSTRUCTURED_GRID
+POINTS 5 float
+0 0 0 1 0 0 1 1 0
+0 1 0 .4 .6 0
+CELLS 4 16
+3 0 1 4
+3 1 2 4
+3 2 3 4
+3 3 0 4
+CELL_TYPES 4
+5
+5
+5
+5
+"""
+NASTRAN = """BEGIN BULK
+GRID,1,,0.,0.,0.
+GRID,2,,1.,0.,0.
+GRID,3,,1.,1.,0.
+GRID,4,0,0.,1.,0.,,
+GRID,5,,.4,.6,0.
+CTRIA3,1,1,1,2,5
+CTRIA3,2,1,2,3,5
+CTRIA3,3,1,3,4,5
+CTRIA3,4,1,4,1,5
+ENDDATA
+"""
+ODD = {
+    "tabs.inp": FLAT.replace(", ", ",\t") + PLATE,
+    "blank-lines.inp": FLAT.replace("3, 1.", "\n** between\n   3, 1.") + "\n\n" + PLATE,
+    "fortran.inp": FLAT.replace(".4, .6", " 4.D-1 , 6.0d-1 , 0.D0,") + PLATE,
+    "no-blanks.inp": (FLAT + PLATE).replace(" ", ""),
+    "two-cards.inp": FLAT.replace("4, 0.", "*Node, nset = More\n4, 0.") + "*NSET, NSET=N\n5\n" + PLATE,
+    "more-fields.inp": FLAT.replace("0., 0.\n", "0., 0., 0., 0., 0., 1.\n") + PLATE,
+    "a.mesh": MEDIT,
+    "a.su2": SU2,
+    "nodes-last.su2": NODES_LAST,
+    "a.msh": MSH,
+    "a.vtk": VTK,
+    "free.bdf": NASTRAN,
+}
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize("name", ODD)
+def test_odd_layouts(tmp_path, name, end):
+    """The node in the middle moves, and its line is the only one that changes."""
+    path, output = tmp_path / name, tmp_path / f"out-{name}"
+    path.write_bytes(ODD[name].replace("\n", end).encode())
+    file = js.read(path)
+    points = np.array(file.mesh.points)
+    points[4] += [0.1, -0.2]
+    assert js.write(output, file, points) == ()
+    tolerance = 1e-7 if points.dtype == np.float32 or name == "a.vtk" else 0
+    assert np.allclose(js.read(output).mesh.points, points, rtol=0, atol=tolerance)
+    lines = [one.read_bytes().split(b"\n") for one in (path, output)]
+    differ = [k for k, (one, other) in enumerate(zip(*lines, strict=True)) if one != other]
+    assert len(differ) == 1
+    assert same_beside(path, output, 5)

@@ -87,6 +87,11 @@ def same_beside(path: Path, output: Path, nodes: int) -> bool:
         b = b.replace(output.stem.encode() + b".h5", stem + b".h5")
     if path.suffix == ".vtu" and b"compressor" in a:
         return _without_points(a) == _without_points(b)
+    if path.suffix == ".npz":
+        one, other = (dict(np.load(p)) for p in (path, output))
+        return one.keys() == other.keys() and all(
+            np.array_equal(one[key], other[key]) != (key == "points") for key in one
+        )
     text = b"\0" not in a and b'"raw"' not in a
     return (
         _same_text(a, b)

@@ -195,6 +195,22 @@ def _text(content: str) -> Callable[[Path], None]:
     return make
 
 
+def _npz(path: Path) -> None:
+    source = _grid()
+    np.savez_compressed(
+        path, points=source.points, hexahedron=source.cells[0].data, words=np.array(["a", "b"])
+    )
+
+
+UGRID = """5 4 0 1 0 0 0
+ 0.0 0.0 0.0   1.0 0.0 0.0
+ 1.0 1.0 0.0   0.0 0.0 1.0
+ 5 5 5
+ 1 3 2  1 2 4  2 3 4  1 4 3
+ 1 2 3 4
+ 1 2 3 4
+"""
+
 SMALL_NASTRAN = """SOL 101
 CEND
 $ loads of the first case
@@ -295,6 +311,10 @@ MAKERS: dict[str, Callable[[Path], None]] = {
     "vtk-legacy-ascii.vtk": _by_vtk(legacy=True, SetFileTypeToASCII=None),
     "vtk-legacy-binary.vtk": _by_vtk(legacy=True, SetFileTypeToBinary=None),
     "vtk-legacy-4.2.vtk": _by_vtk(legacy=True, single=True, SetFileTypeToBinary=None, SetFileVersion=42),
+    "meshio.avs": _by_meshio("avsucd"),
+    "meshio.vol": _by_meshio("netgen"),
+    "numpy.npz": _npz,
+    "hand.ugrid": _text(UGRID),
     "hand-fields.nas": _text(SMALL_NASTRAN),
     "hand-assembly.inp": _text(ABAQUS),
     "hand-crlf.inp": _text(ABAQUS.replace("\n", "\r\n")),

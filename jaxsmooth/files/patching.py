@@ -40,8 +40,8 @@ def patch_file(
         format: the one to write.
 
     Returns:
-        The new bytes; None where input and output are of different formats, the file was not read from
-        one, its source was changed since, or the format knows no way.
+        The new bytes; None where input and output are of different formats or compressed, the file was not
+        read from one, its source was changed since, or the format knows no way.
 
     Raises:
         UnpatchableError: it should be possible, but isn't.
@@ -49,7 +49,7 @@ def patch_file(
     record = format_named(format)
     if file.original is None or record is None or record.patch is None or format != file.format:
         return None
-    if fingerprint(file.source) != file.original.marks:
+    if fingerprint(file.source) != file.original.marks or ".gz" in (output.suffix, file.original.path.suffix):
         return None
     content = file.original.read()
     if content is None:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsmooth.files.formats.mshraw import msh_format
+from jaxsmooth.files.formats.mshraw import msh_format, section_span
 from jaxsmooth.files.formats.record import Patched, Source, UnpatchableError
 from jaxsmooth.files.numbers import Places, put_binary, put_text, tokens
 
@@ -83,11 +83,10 @@ def without_parameters(content: bytes) -> bytes:
 def _nodes(content: bytes) -> tuple[bool, np.ndarray, np.ndarray, list[_Block]]:
     """Whether the file is binary; first and last bytes of the words of $Nodes in text; the blocks."""
     found = msh_format(content)
-    at = content.find(b"$Nodes")
-    if found is None or at < 0:
-        raise UnpatchableError("it has no section $Nodes")
+    if found is None:
+        raise UnpatchableError("it does not say its version")
     version, binary, size = found
-    start, end = content.index(b"\n", at) + 1, content.find(b"$EndNodes", at)
+    start, end = section_span(content, "Nodes")
     walk = {"2": _walk2, "4": _walk40 if version == "4.0" else _walk41}.get(version[0])
     if walk is None:
         raise UnpatchableError(f"its version {version} is not known")

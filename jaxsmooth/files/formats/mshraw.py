@@ -13,16 +13,15 @@ import numpy as np
 from jaxsmooth.convert.checks import parse_numbers
 from jaxsmooth.files.formats.mshtypes import NODES_OF
 
-__all__ = ["Section", "check_msh", "entities", "entity_groups", "msh_format"]
+__all__ = ["Section", "check_msh", "entities", "entity_groups", "msh_format", "section_span"]
 
 
 class Section:
     """The numbers of a section, taken from its begin to its end."""
 
     def __init__(self, content: bytes, name: str, binary: bool, size: int):
-        start = content.index(b"$" + name.encode())
         self.name, self.binary, self.size = name, binary, size
-        self.body = content[content.index(b"\n", start) + 1 : content.find(b"$End" + name.encode(), start)]
+        self.body = content[slice(*section_span(content, name))]
         self.at = 0
         if not binary:
             self.numbers = parse_numbers(self.body, f"its section ${name}")
@@ -57,6 +56,14 @@ class Section:
 
 
 _CUT = "the file is damaged or cut short"
+
+
+def section_span(content: bytes, name: str) -> tuple[int, int]:
+    """First byte of what stands in a section, and the byte behind the last; `ValueError` without it."""
+    found = re.search(rb"^\$%s[ \t]*\r?\n" % name.encode(), content, re.M)
+    if found is None:
+        raise ValueError(f"it has no section ${name}")
+    return found.end(), content.find(b"$End" + name.encode(), found.end())
 
 
 def msh_format(content: bytes) -> tuple[str, bool, int] | None:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import io
+import zipfile
 from pathlib import Path
 
 import meshio
 import numpy as np
+from jaxtyping import Float
 
 from jaxsmooth.cells.table import TYPES
-from jaxsmooth.files.formats.record import Format, Holds
+from jaxsmooth.files.formats.record import Format, Holds, Patched, Source
+from jaxsmooth.files.numbers import check_old
 
-__all__ = ["NPZ", "read_npz", "write_npz"]
+__all__ = ["NPZ", "patch_npz", "read_npz", "write_npz"]
 
 _TYPES = ("vertex", *TYPES)
 
@@ -33,7 +37,7 @@ def read_npz(path: Path) -> tuple[meshio.Mesh, list[str]]:
         elif values.ndim and len(values) == len(points):
             point_data[key] = values
         else:
-            notes.append(f"the array {key!r} is neither cells nor data of nodes or cells; it is not kept")
+            notes.append(f"the array {key!r} is neither cells nor data; it is kept in .npz files only")
     filled = {
         key: [parts.get(kind, np.full(len(nodes), np.nan)) for kind, nodes in cells]
         for key, parts in cell_data.items()
@@ -54,4 +58,20 @@ def write_npz(path: Path, mesh: meshio.Mesh, dim: int, variant: str = "") -> lis
     return []
 
 
-NPZ = Format("npz", (".npz",), read_npz, write_npz, Holds(any_data=True))
+def patch_npz(
+    source: Source, old: Float[np.ndarray, "nodes dim"], new: Float[np.ndarray, "nodes dim"]
+) -> Patched:
+    """The archive with other points; all other arrays, also those that are not known, as they are."""
+    out, array = io.BytesIO(), io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(source.content)) as archive, zipfile.ZipFile(out, "w") as copy:
+        for member in archive.infolist():
+            data = archive.read(member)
+            if member.filename == "points.npy":
+                check_old(np.load(io.BytesIO(data)), old)
+                np.save(array, new)
+                data = array.getvalue()
+            copy.writestr(member, data)
+    return Patched(out.getvalue())
+
+
+NPZ = Format("npz", (".npz",), read_npz, write_npz, Holds(any_data=True), patch=patch_npz)

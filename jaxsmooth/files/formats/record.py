@@ -10,7 +10,7 @@ import meshio
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["Format", "Holds", "Patched", "Source", "UnpatchableError", "keep_nothing", "stem_format"]
+__all__ = ["Format", "Holds", "Patch", "Patched", "Source", "UnpatchableError", "keep_nothing", "stem_format"]
 
 Reader = Callable[[Path], tuple[meshio.Mesh, list[str]]]
 Writer = Callable[[Path, meshio.Mesh, int, str], list[str]]

@@ -10,6 +10,7 @@ import numpy as np
 from jaxsmooth.convert.checks import check_last_line
 from jaxsmooth.files.formats.meshios import read_as
 from jaxsmooth.files.formats.record import Format, Holds
+from jaxsmooth.files.formats.tables import patch_table
 from jaxsmooth.files.reduction import keep_boundary_tags
 
 __all__ = ["UGRID", "is_text", "read_ugrid", "write_ugrid"]
@@ -103,4 +104,5 @@ UGRID = Format(
         reduce=lambda mesh, dim: keep_boundary_tags(mesh, dim, "ugrid:ref", 2)[0],
     ),
     refuse=_refuse,
+    patch=patch_table(rb"\A\s*(\d+)(?:\s+\d+){6}\s", 0),
 )
