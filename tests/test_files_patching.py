@@ -407,6 +407,8 @@ def test_partitions_of_gmsh(made):
     assert len(parts.mesh.points) == len(whole.mesh.points)
     for name in ("material 0", "material 1", "left"):
         assert parts.named_sets[name].sum() == whole.named_sets[name].sum() > 0
+    tags = [np.unique(np.concatenate(file.source.cell_data["gmsh:geometrical"])) for file in (whole, parts)]
+    assert np.array_equal(*tags)  # no borders between partitions
 
 
 def test_a_plane_mesh_with_its_plane_in_space(made, tmp_path):

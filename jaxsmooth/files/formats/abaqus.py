@@ -95,7 +95,7 @@ def patch_abaqus(
     source: Source, old: Float[np.ndarray, "nodes dim"], new: Float[np.ndarray, "nodes dim"]
 ) -> Patched:
     """The file with other coordinates in its node cards, those of instances in their part."""
-    model = read_model(source.content, source.path.parent)
+    model = read_model(source.content, source.path.parent, frozenset({"NODE", "INSTANCE"}))
     if any(span is None for part in model.parts for span in part.spans):
         raise UnpatchableError(f"its nodes are in other files ({', '.join(model.files)})")
     check_old(np.concatenate([place(part)[0] for part in model.parts]), old, 1e-15)

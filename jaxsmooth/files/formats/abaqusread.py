@@ -119,13 +119,13 @@ class Model:
     files: list[str]
 
 
-def read_model(content: bytes, folder: Path) -> Model:
-    """The model of an input file; includes are followed, instances placed.
+def read_model(content: bytes, folder: Path, wanted: frozenset[str] | None = None) -> Model:
+    """The model of an input file; includes are followed, instances placed; see `read_cards` for `wanted`.
 
     Raises `ValueError` in one sentence."""
     model, parts, instances, others, files = Part(), {}, {}, set(), {}
     current, heading = model, ""
-    for card in read_cards(content, folder):
+    for card in read_cards(content, folder, wanted):
         key, options, lines = card.key, card.options, card.lines
         if card.file is not None:
             files[card.file] = True

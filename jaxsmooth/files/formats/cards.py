@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxsmooth.convert.checks import check_last_line
+from jaxsmooth.convert.checks import check_last_line, parse_numbers
 from jaxsmooth.files.numbers import Places
 
 __all__ = ["Card", "integers_of", "node_places", "nodes_of", "read_cards", "set_members"]
@@ -37,8 +37,12 @@ class Card:
     file: str | None = None
 
 
-def read_cards(content: bytes, folder: Path, depth: int = 0) -> Iterator[Card]:
-    """All cards of a file in a folder, those of included files in their places."""
+def read_cards(
+    content: bytes, folder: Path, wanted: frozenset[str] | None = None, depth: int = 0
+) -> Iterator[Card]:
+    """All cards of a file in a folder, those of included files in their places.
+
+    Only cards with the `wanted` keywords have their data lines; None for all."""
     check_last_line(content, b"**")
     starts = [found.start() for found in re.finditer(rb"^\*(?=[^*])", content, re.M)]
     for start, end in pairwise([*starts, len(content)]):
@@ -54,12 +58,14 @@ def read_cards(content: bytes, folder: Path, depth: int = 0) -> Iterator[Card]:
             if depth > 8 or not other.is_file():
                 raise ValueError(f"its *INCLUDE file {options.get('INPUT', '')!r} isn't there")
             yield Card(key, options, [], None, _relative(other, folder))
-            for card in read_cards(other.read_bytes(), other.parent, depth + 1):
+            for card in read_cards(other.read_bytes(), other.parent, wanted, depth + 1):
                 yield replace(
                     card, span=None, file=_relative(other.parent / (card.file or other.name), folder)
                 )
             continue
-        lines, file = _lines(content[start:end]), None
+        lines, file = [], None
+        if wanted is None or key in wanted:
+            lines = _lines(content[start:end])
         if key in ("NODE", "ELEMENT", "NSET", "ELSET") and "INPUT" in options:
             other = folder / options.pop("INPUT")
             if not other.is_file():
@@ -99,16 +105,23 @@ def node_places(content: bytes, start: int, end: int) -> Places:
 
 def integers_of(lines: list[str]) -> np.ndarray:
     """All numbers of data lines."""
-    return np.array([word for word in ",".join(lines).split(",") if word.strip()], dtype=np.int64)
+    return parse_numbers(" ".join(lines).replace(",", " "), "one of its cards", np.int64)
 
 
 def nodes_of(lines: list[str]) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of nodes, and their coordinates ``[nodes, 3]``; what is left out is 0."""
     if not lines:
         return np.zeros(0, np.int64), np.zeros((0, 3))
+    commas = {line.rstrip(",").count(",") for line in lines}
+    if commas in ({2}, {3}):  # the usual case, if no field is empty
+        text = " ".join(lines).replace(",", " ").upper().replace("D", "E")  # Fortran's exponent
+        numbers, width = parse_numbers(text, "one of its node cards"), 1 + commas.pop()
+        if len(numbers) == width * len(lines):
+            table = numbers.reshape(-1, width)
+            return table[:, 0].astype(np.int64), np.pad(table[:, 1:], ((0, 0), (0, 4 - width)))
     rows = [line.rstrip(",").split(",")[:4] for line in lines]
     rows = [[word if word.strip() else "0" for word in row] + ["0"] * (4 - len(row)) for row in rows]
-    table = np.char.replace(np.char.upper(np.array(rows)), "D", "E")  # Fortran's exponent
+    table = np.char.replace(np.char.upper(np.array(rows)), "D", "E")
     return table[:, 0].astype(np.int64), table[:, 1:].astype(np.float64)
 
 

@@ -19,7 +19,7 @@ from jaxsmooth.files.formats.msh import (
     write_msh41,
 )
 from jaxsmooth.files.formats.mshnodes import patch_msh
-from jaxsmooth.files.formats.mshraw import check_msh, entity_groups
+from jaxsmooth.files.formats.mshraw import check_msh, read_entities
 from jaxsmooth.files.formats.record import Format, Holds
 from jaxsmooth.files.reduction import GMSH_TAGS, as_tags, material_name
 
@@ -36,7 +36,7 @@ def read_gmsh(path: Path) -> tuple[meshio.Mesh, list[str]]:
     else:
         mesh = read_copy(repaired, path, "gmsh")
         mesh.cell_data.update(read_msh_data(content, mesh))
-    keep_groups(mesh, entity_groups(content))
+    keep_groups(mesh, read_entities(content))
     return mesh, []
 
 

@@ -15,6 +15,7 @@ import copy
 import io
 import re
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 import meshio
@@ -22,7 +23,7 @@ import numpy as np
 
 from jaxsmooth.convert.regions import GROUPS, recall
 from jaxsmooth.files.formats.mshnodes import without_parameters
-from jaxsmooth.files.formats.mshraw import Section, entities, msh_format
+from jaxsmooth.files.formats.mshraw import Entity, msh_format, read_entities, section_span
 from jaxsmooth.files.formats.mshtypes import CODES, in_gmsh_order
 
 __all__ = [
@@ -53,7 +54,7 @@ def repaired_msh(content: bytes) -> bytes:
         return re.sub(rb"\$ElementData\r?\n.*?\$EndElementData[^\n]*\n?", b"", content, flags=re.DOTALL)
     if not version.startswith("4"):
         return content
-    content = _with_physical_groups(without_parameters(content), binary, size, version)
+    content = _with_physical_groups(without_parameters(content), binary, size)
     return re.sub(rb"^(\$MeshFormat\s+4)(?=\s)", rb"\1.0", content, count=1)  # 4.1 to meshio
 
 
@@ -93,50 +94,48 @@ def read_msh_data(content: bytes, mesh: meshio.Mesh) -> dict[str, list[np.ndarra
     return found
 
 
-def keep_groups(mesh: meshio.Mesh, groups: dict[tuple[int, int], list[int]]) -> None:
-    """Give a 4.1 mesh what meshio drops: all groups of the entities that are in several.
+def keep_groups(mesh: meshio.Mesh, entities: Sequence[Entity]) -> None:
+    """Give a mesh of version 4 what meshio drops: the entities of partitions, and all groups of an entity.
 
     ``gmsh:physical`` has room for one; the group with the fewest cells says most about them."""
+    groups = {(one.dim, one.tag): one.groups for one in entities}
     several = {key: own for key, own in groups.items() if len(own) > 1}
-    if not several or "gmsh:physical" not in mesh.cell_data:
-        return
-    entities = [
-        (c.dim, int(t[0])) for c, t in zip(mesh.cells, mesh.cell_data["gmsh:geometrical"], strict=True)
-    ]
-    sizes: dict[tuple[int, int], int] = {}
-    for key, cells in zip(entities, mesh.cells, strict=True):
-        for group in groups.get(key, ()):
-            sizes[key[0], group] = sizes.get((key[0], group), 0) + len(cells)
-    for k, key in enumerate(entities):
-        if key in several:
-            least = min(several[key], key=lambda group, dim=key[0]: sizes[dim, group])
-            mesh.cell_data["gmsh:physical"][k] = np.full(len(mesh.cells[k]), least)
-    mesh.info = {GROUPS: several}
+    tags = mesh.cell_data.get("gmsh:geometrical", [])
+    keys = [(cells.dim, int(own[0])) for cells, own in zip(mesh.cells, tags, strict=False)]
+    if several and "gmsh:physical" in mesh.cell_data:
+        sizes: dict[tuple[int, int], int] = {}
+        for key, cells in zip(keys, mesh.cells, strict=True):
+            for group in groups.get(key, ()):
+                sizes[key[0], group] = sizes.get((key[0], group), 0) + len(cells)
+        for k, key in enumerate(keys):
+            if key in several:
+                least = min(several[key], key=lambda group, dim=key[0]: sizes[dim, group])
+                mesh.cell_data["gmsh:physical"][k] = np.full(len(mesh.cells[k]), least)
+        mesh.info = {GROUPS: several}
+    parents = {(one.dim, one.tag): one.parent for one in entities if one.parent is not None}
+    for k, key in enumerate(keys):
+        if key in parents and parents[key][0] == key[0]:
+            tags[k] = np.full(len(mesh.cells[k]), parents[key][1])
 
 
-def _with_physical_groups(content: bytes, binary: bool, size: int, version: str) -> bytes:
+def _with_physical_groups(content: bytes, binary: bool, size: int) -> bytes:
     """Entities of partitions among the others, and the group 0 for those without beside others with one."""
-    start = content.find(b"$Entities")
-    if start < 0:
+    found = read_entities(content)
+    several = len({bool(one.groups) for one in found}) > 1
+    if not found or not (several or any(one.parent for one in found)):
         return content
-    found = list(entities(Section(content, "Entities", binary, size), version))
-    if b"$PartitionedEntities" in content:
-        known = {(dim, tag) for dim, tag, *_ in found}
-        more = entities(Section(content, "PartitionedEntities", binary, size), version)
-        found += [one for one in more if one[:2] not in known]
-        found.sort(key=lambda one: one[:2])
-    elif len({bool(groups) for _, _, groups, _, _ in found}) < 2:
-        return content
-    some = any(groups for _, _, groups, _, _ in found)
-    rows = [[("<u8" if size == 8 else "<u4", [sum(one[0] == dim for one in found) for dim in range(4)])]]
-    for dim, tag, groups, box, bounds in found:
-        groups = groups or [0] * some
-        row = [("<i4", tag), ("<f8", box), (rows[0][0][0], len(groups)), ("<i4", groups)]
-        rows.append(row + ([(rows[0][0][0], len(bounds)), ("<i4", bounds)] if dim else []))
+    found = sorted({(one.dim, one.tag): one for one in found[::-1]}.values(), key=lambda one: one[:2])
+    number = f"<u{size}"
+    rows = [[(number, [sum(one.dim == dim for one in found) for dim in range(4)])]]
+    for one in found:
+        groups = one.groups or [0] * several
+        row = [("<i4", one.tag), ("<f8", one.box), (number, len(groups)), ("<i4", groups)]
+        rows.append(row + ([(number, len(one.bounds)), ("<i4", one.bounds)] if one.dim else []))
     out = io.BytesIO()
     _section(out, "Entities", rows, binary)
-    end = content.index(b"$EndEntities", start) + len(b"$EndEntities")
-    return content[:start] + out.getvalue().rstrip() + content[end:]
+    start, end = section_span(content, "Entities")
+    start = content.rindex(b"$Entities", 0, start)
+    return content[:start] + out.getvalue().rstrip() + content[end + len(b"$EndEntities") :]
 
 
 # --- Writing 4.1 -------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""What a Gmsh file itself says: whether it is whole, and the physical groups of its entities.
+"""What a Gmsh file itself says: whether it is whole, and its entities.
 
 meshio (5.3.5) takes sections that end early, wrong counts, and tags of nodes that aren't there; of the
 groups of an entity it keeps the first."""
@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxsmooth.convert.checks import parse_numbers
 from jaxsmooth.files.formats.mshtypes import NODES_OF
 
-__all__ = ["Section", "check_msh", "entities", "entity_groups", "msh_format", "section_span"]
+__all__ = ["Entity", "Section", "check_msh", "msh_format", "read_entities", "section_span"]
 
 
 class Section:
@@ -192,22 +193,33 @@ def _elements4(section: Section) -> Iterator[np.ndarray]:
         raise ValueError(f"its section $Elements has {total} elements and says {count}; {_CUT}")
 
 
-def entity_groups(content: bytes) -> dict[tuple[int, int], list[int]]:
-    """The physical groups of a 4.x file's entities, and of their partitions ``{(dim, tag): groups}``."""
+class Entity(NamedTuple):
+    """A point, curve, surface or volume of the geometry, or the part of one that is in a partition."""
+
+    dim: int
+    tag: int
+    groups: list[int]
+    box: np.ndarray
+    bounds: list[int]
+    parent: tuple[int, int] | None
+
+
+def read_entities(content: bytes) -> list[Entity]:
+    """The entities of a file of version 4, those of partitions last."""
     found = msh_format(content)
     if found is None or not found[0].startswith("4"):
-        return {}
-    groups = {}
-    for name in ("Entities", "PartitionedEntities"):
-        if b"$" + name.encode() in content:
-            for dim, tag, own, _, _ in entities(Section(content, name, found[1], found[2]), found[0]):
-                groups[dim, tag] = own
-    return groups
+        return []
+    version, binary, size = found
+    return [
+        entity
+        for name in ("Entities", "PartitionedEntities")
+        if re.search(rb"^\$%s\b" % name.encode(), content, re.M)
+        for entity in _entities(Section(content, name, binary, size), version)
+    ]
 
 
-def entities(section: Section, version: str) -> Iterator[tuple[int, int, list[int], np.ndarray, list[int]]]:
-    """Dimension, tag, physical groups, box and bounding entities of the entities of a file of version 4."""
-    parts = section.name == "PartitionedEntities"
+def _entities(section: Section, version: str) -> Iterator[Entity]:
+    parts, parent = section.name == "PartitionedEntities", None
     if parts:
         section.take(1, "n")
         ghosts = section.take(1, "n")[0]
@@ -216,10 +228,11 @@ def entities(section: Section, version: str) -> Iterator[tuple[int, int, list[in
         for _ in range(count):
             tag = int(section.take(1)[0])
             if parts:
-                section.take(2)  # the entity it is a part of
-                section.take(section.take(1, "n")[0])
+                above, own = section.take(2).tolist()
+                parent = above, own
+                section.take(section.take(1, "n")[0])  # its partitions
             box = section.take(6 if dim or version == "4.0" else 3, "d")
-            groups = [int(g) for g in section.take(section.take(1, "n")[0])]
-            bounds = [int(b) for b in section.take(section.take(1, "n")[0])] if dim else []
-            yield dim, tag, groups, box, bounds
+            groups = section.take(section.take(1, "n")[0]).tolist()
+            bounds = section.take(section.take(1, "n")[0]).tolist() if dim else []
+            yield Entity(dim, tag, groups, box, bounds, parent)
     section.end()

@@ -66,15 +66,8 @@ def read_su2(path: Path) -> tuple[meshio.Mesh, list[str]]:
         elif key != "NZONE":
             rest += lines[start:end]
     if points is None or not dim or not {"NELEM", "NMARK"} <= counts.keys():
-        missing = (
-            "NDIME"
-            if not dim
-            else "NPOIN"
-            if points is None
-            else "NELEM"
-            if "NELEM" not in counts
-            else "NMARK"
-        )
+        have = {"NDIME": dim, "NPOIN": points is not None, "NELEM": "NELEM" in counts, "NMARK": False}
+        missing = next(name for name, there in have.items() if not there)
         raise ValueError(f"it has no section {missing}; {_CUT}")
     if counts["NMARK"] != len(markers) or not all(name in counts for name in markers):
         complete = sum(name in counts for name in markers)
