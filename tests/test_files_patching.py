@@ -1,10 +1,12 @@
 """What goes in comes out: output in the input's format is the input with other coordinates in it."""
 
 import dataclasses
+import json
 import os
 import re
 from pathlib import Path
 
+import jax.numpy as jnp
 import meshio
 import numpy as np
 import pytest
@@ -255,6 +257,22 @@ def test_the_command_line_copies_too(tmp_path, capsys):
         output = tmp_path / name
         assert main(["smooth", str(DATA / name), str(output), "--steps", "0"]) in (0, 3)  # some are inverted
         assert output.read_bytes() == (DATA / name).read_bytes()
+
+
+def test_what_is_said_on_the_coordinates_is_said_at_the_end(made, tmp_path, capsys, monkeypatch):
+    """The trial before the work changes no coordinate, so it rounds none."""
+    from jaxsmooth import cli
+
+    def run(file, *args):
+        result = smooth(file, *args)
+        return dataclasses.replace(result, mesh=file.mesh.with_points(jnp.asarray(moved(file))))
+
+    smooth = cli._run
+    monkeypatch.setattr(cli, "_run", run)
+    words = ["smooth", str(made("hand-fields.nas")), str(tmp_path / "a.nas"), "--steps", "0", "-q"]
+    assert cli.main([*words, "--json", str(tmp_path / "a.json")]) == 0
+    assert capsys.readouterr().err.count("fields of 8 columns round coordinates by at most") == 1
+    assert "fields of 8 columns" in json.loads((tmp_path / "a.json").read_text())["notes"][-1]
 
 
 # --- Single formats ------------------------------------------------------------------------

@@ -36,7 +36,8 @@ __all__ = [
 def read(path: str | Path, *, dtype: Any = None) -> MeshFile:
     """Read a mesh file, by its suffix and its first bytes.
 
-    All formats that meshio reads, and ``.npz`` archives with ``points`` and one array a cell type.
+    All formats that meshio reads, universal files, and ``.npz`` archives with ``points`` and one array a cell
+    type.  The file's bytes are kept, or read again if there are more than 64 MiB of them, for `write`.
 
     Args:
         path: the file.
