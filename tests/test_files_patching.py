@@ -351,6 +351,18 @@ def test_cards_that_are_lost_are_said(tmp_path):
     assert lost in js.write(tmp_path / "b.inp", dataclasses.replace(file, original=None))[0]
 
 
+def test_sections_and_cards_that_are_lost_elsewhere(made, tmp_path):
+    file = js.read(made("hand-fields.nas"))
+    assert file.notes[0] == (
+        "cards of the Nastran file that are not mesh are kept in Nastran files only (FORCE, MAT1)"
+    )
+    assert "the other cards of the Nastran file (FORCE, MAT1)" in js.write(tmp_path / "a.vtu", file)[0]
+    (tmp_path / "a.mesh").write_text(MEDIT.replace("RequiredVertices", "Ridges 1 1 RequiredVertices"))
+    file = js.read(tmp_path / "a.mesh")
+    assert file.notes == ("the section Ridges of the Medit file is kept in Medit files only",)
+    assert "sections of the Medit file (Ridges)" in js.write(tmp_path / "a.vtu", file)[0]
+
+
 def test_files_beside_an_xdmf_file(made, tmp_path):
     pytest.importorskip("h5py")
     for name in ("meshio-hdf5.xdmf", "meshio-hdf5.h5"):

@@ -8,6 +8,7 @@ from test_files_damage import plane
 import jaxsmooth as js
 from jaxsmooth.files.formats.record import Format, Holds
 from jaxsmooth.files.formats.table import FORMATS, detect_format, format_of_suffix, register
+from jaxsmooth.files.formats.tables import patch_table
 from jaxsmooth.files.io import MeshFileError, check_types
 
 
@@ -51,6 +52,17 @@ def test_a_format_of_ones_own(tmp_path, table):
     with pytest.raises(MeshFileError, match=r"a\.tri: not readable as tri: could not convert") as caught:
         js.read(tmp_path / "a.tri")
     assert "\n" not in str(caught.value)
+
+
+def test_a_format_of_ones_own_that_is_copied(tmp_path, table):
+    """With a way to find its coordinates, the rest of a file stays, also what its reader skips."""
+    register(Format("tri", (".tri",), read_tri, write_tri, patch=patch_table(rb"\A\s*(\d+)", 0, width=2)))
+    (tmp_path / "a.tri").write_text("4 \n0  0\n1  0\n1  1\n.4 .6\n0 1 3\n1 2  3\n")
+    file = js.read(tmp_path / "a.tri")
+    points = np.array(file.mesh.points)
+    points[3] = [0.5, 0.75]
+    assert js.write(tmp_path / "b.tri", file, points) == ()
+    assert (tmp_path / "b.tri").read_text() == "4 \n0  0\n1  0\n1  1\n0.5 0.75\n0 1 3\n1 2  3\n"
 
 
 def test_a_format_that_shares_a_suffix(tmp_path, table):

@@ -64,7 +64,11 @@ def patch_file(
             _check(record, patched, source, file.source, new)
     except UnpatchableError:
         raise
-    except (ValueError, LookupError, OSError, struct.error, zlib.error) as error:
+    except OSError as error:  # a companion that is gone, no room for the check
+        raise UnpatchableError(
+            f"the copy could not be made or checked ({error.strerror or error})"
+        ) from error
+    except (ValueError, LookupError, struct.error, zlib.error) as error:
         text = " ".join(str(error).split())[:200]
         raise UnpatchableError(f"the coordinates could not be found in it ({text})") from error
     here, there = output.parent.resolve(), file.original.path.parent.resolve()

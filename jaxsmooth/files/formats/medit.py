@@ -16,7 +16,7 @@ from jaxsmooth.convert.labels import HELD
 from jaxsmooth.convert.regions import integers
 from jaxsmooth.files.formats.record import Format, Holds, Patched, Source, UnpatchableError
 from jaxsmooth.files.numbers import Places, blanked, put_binary, put_text, tokens
-from jaxsmooth.files.reduction import as_tags, material_name
+from jaxsmooth.files.reduction import UNKEPT, as_tags, material_name
 
 __all__ = ["MEDIT", "read_medit", "write_medit"]
 
@@ -61,7 +61,7 @@ def read_medit(path: Path) -> tuple[meshio.Mesh, list[str]]:
 
 def _mesh(sections: list[tuple[str, str]]) -> tuple[meshio.Mesh, list[str]]:
     dtype, dim, points, references = np.float64, 0, None, None
-    cells, tags, notes, sets, required = [], [], [], {}, {}
+    cells, tags, notes, unkept, sets, required = [], [], [], [], {}, {}
     for key, body in sections:
         if key == "MeshVersionFormatted":
             dtype = np.float32 if body.strip() == "1" else np.float64
@@ -80,7 +80,8 @@ def _mesh(sections: list[tuple[str, str]]) -> tuple[meshio.Mesh, list[str]]:
         elif key in _REQUIRED:
             required[key] = _rows(key, body, 1, np.int64)[:, 0] - 1
         elif key.lower() != "end" and body.split() not in ([], ["0"]):
-            notes.append(f"the section {key} of the Medit file is not kept")
+            unkept.append(key)
+            notes.append(f"the section {key} of the Medit file is kept in Medit files only")
     if points is None or dim not in (2, 3):
         raise ValueError("it has no Dimension of 2 or 3 before its Vertices")
     for key, members in sets.items():
@@ -93,10 +94,13 @@ def _mesh(sections: list[tuple[str, str]]) -> tuple[meshio.Mesh, list[str]]:
     held = [np.zeros(0, np.int64)]
     for key, chosen in required.items():
         held.append(_nodes(_REQUIRED[key], chosen, cells))
-        kept = f"{len(np.unique(held[-1]))} nodes are held, but it is not written again"
+        kept = f"{len(np.unique(held[-1]))} nodes are held, and it is kept in Medit files only"
         notes.append(f"the section {key} of the Medit file: its {kept}")
+    unkept += required
+    if unkept:
+        mesh.info = {UNKEPT: [("", f"sections of the Medit file ({', '.join(unkept)})")]}
     if required:
-        mesh.info = {HELD: np.unique(np.concatenate(held))}
+        mesh.info[HELD] = np.unique(np.concatenate(held))
     return mesh, notes
 
 

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from jaxsmooth.files.formats.meshios import read_as, reduce_rare, write_again
 from jaxsmooth.files.formats.record import Format, Holds, Patched, Source, UnpatchableError
 from jaxsmooth.files.numbers import check_columns, check_old
+from jaxsmooth.files.reduction import UNKEPT
 
 __all__ = ["NASTRAN", "patch_nastran", "read_nastran"]
 
@@ -25,15 +26,31 @@ _TYPES = (
 )
 
 
+_CELLS = (
+    "CBAR CBEAM CBUSH CBUSH1D CGAP CROD CTRIAR CTRIA3 CTRIA6 CTRAX6 CTRIAX6 CQUADR CSHEAR CQUAD4 CQUAD8 "
+    "CQUAD9 CTETRA CPYRA CPYRAM CPENTA CHEXA"
+)
+_MESH = frozenset((*_CELLS.split(), "GRID", "ENDDATA"))
+
+
 def read_nastran(path: Path) -> tuple[meshio.Mesh, list[str]]:
     """A file of bulk data, whether or not other sections come first."""
     content = path.read_bytes()
-    if re.search(rb"^[ \t]*BEGIN BULK", content, re.M):
-        return _READ(path)
-    with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder) / "mesh.bdf"
-        copy.write_bytes(b"BEGIN BULK\n" + content)
-        return _READ(copy)
+    begin = re.search(rb"^[ \t]*BEGIN BULK", content, re.M)
+    if begin:
+        mesh, notes = _READ(path)
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            copy = Path(folder) / "mesh.bdf"
+            copy.write_bytes(b"BEGIN BULK\n" + content)
+            mesh, notes = _READ(copy)
+    words = re.compile(rb"^([A-Z][A-Z0-9]*)", re.M).findall(content, begin.end() if begin else 0)
+    cards = sorted({word.decode() for word in words} - _MESH)
+    if cards:
+        named = ", ".join(cards[:4]) + (", …" if len(cards) > 4 else "")
+        mesh.info = {UNKEPT: [("", f"the other cards of the Nastran file ({named})")]}
+        notes.append(f"cards of the Nastran file that are not mesh are kept in Nastran files only ({named})")
+    return mesh, notes
 
 
 _READ = read_as("nastran", text=True, end="ENDDATA")

@@ -6,7 +6,9 @@
     register(Format("xyz", (".xyz",), read=read_xyz, write=write_xyz))
 
 ``read_xyz(path)`` returns a `meshio.Mesh` and a list of notes, ``write_xyz(path, mesh, dim, variant)`` a
-list of notes.  From then on `jaxsmooth.read` and `jaxsmooth.write` know the suffix.
+list of notes.  From then on `jaxsmooth.read` and `jaxsmooth.write` know the suffix.  With a `Format.patch`,
+output in the format of the input is a copy of the input with other coordinates in it; `tables.patch_table`
+makes one for text in which the nodes stand one after another.
 """
 
 from __future__ import annotations
