@@ -112,14 +112,15 @@ def _add_text(vtk, grid) -> None:
     for k in range(grid.GetNumberOfCells()):
         names.InsertNextValue(f"cell {k}")
         bits.InsertNextValue(k % 2)
-    grid.GetFieldData().AddArray(_time(vtk))
-
-
-def _time(vtk):
+    for name, made in (("material", vtk.vtkIntArray()), ("kind", vtk.vtkUnsignedCharArray())):
+        made.SetName(name)
+        grid.GetCellData().AddArray(made)
+        for k in range(grid.GetNumberOfCells()):
+            made.InsertNextValue(k % 3)
     time = vtk.vtkDoubleArray()
     time.SetName("TimeValue")
     time.InsertNextValue(0.25)
-    return time
+    grid.GetFieldData().AddArray(time)
 
 
 def _by_vtk(legacy: bool = False, single: bool = False, **modes) -> Callable[[Path], None]:
@@ -140,10 +141,7 @@ def _by_vtk(legacy: bool = False, single: bool = False, **modes) -> Callable[[Pa
             array = numpy_to_vtk(values, deep=True)
             array.SetName(name)
             grid.GetPointData().AddArray(array)
-        if legacy:  # meshio knows no text there
-            grid.GetFieldData().AddArray(_time(vtk))
-        else:
-            _add_text(vtk, grid)
+        _add_text(vtk, grid)
         writer = vtk.vtkUnstructuredGridWriter() if legacy else vtk.vtkXMLUnstructuredGridWriter()
         for name, value in modes.items():
             getattr(writer, name)(*([] if value is None else [value]))
@@ -291,6 +289,7 @@ MAKERS: dict[str, Callable[[Path], None]] = {
     "gmsh.bdf": _by_gmsh(),
     "gmsh.unv": _by_gmsh(SaveGroupsOfNodes=1),
     "gmsh.vtk": _by_gmsh(),
+    "gmsh.med": _by_gmsh(),
     "meshio.meshb": _by_meshio("medit"),
     "meshio-xml.xdmf": _by_meshio("xdmf", data_format="XML"),
     "meshio-hdf5.xdmf": _by_meshio("xdmf"),

@@ -10,8 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsmooth.convert.checks import check_last_line
+from jaxsmooth.files.formats.meshios import read_copy
 from jaxsmooth.files.formats.record import Format, Holds, Patched, Source, UnpatchableError
+from jaxsmooth.files.formats.vtktext import with_sizes, without_text
 from jaxsmooth.files.numbers import Places, put_binary, put_text, tokens
+from jaxsmooth.files.reduction import UNKEPT
 
 __all__ = ["VTK", "VTK42", "check_vtk", "pad_pairs", "patch_vtk", "read_vtk"]
 
@@ -19,10 +22,18 @@ _CUT = "the file is damaged or cut short"
 
 
 def read_vtk(path: Path) -> tuple[meshio.Mesh, list[str]]:
-    """A legacy file of any version."""
-    mesh = meshio.read(path, file_format="vtk")
-    check_vtk(path.read_bytes(), mesh)
-    return mesh, []
+    """A legacy file of any version; text and bits among its data are left out."""
+    content = path.read_bytes()
+    version, variant = _sniff(content[:4096])
+    repaired, names = without_text(content, variant == "binary")
+    repaired = with_sizes(repaired) if version >= 5 else repaired
+    same = repaired == content
+    mesh = meshio.read(path, file_format="vtk") if same else read_copy(repaired, path, "vtk")
+    check_vtk(content, mesh)
+    if not names:
+        return mesh, []
+    mesh.info = {UNKEPT: [("", f"data of text or bits ({', '.join(names)})")]}
+    return mesh, [f"data of text or bits are kept in VTK files only ({', '.join(names)})"]
 
 
 def check_vtk(content: bytes, mesh: meshio.Mesh) -> None:
