@@ -152,29 +152,39 @@ def _by_vtk(legacy: bool = False, single: bool = False, **modes) -> Callable[[Pa
     return make
 
 
-def _classic_exodus(path: Path) -> None:
-    """The older netCDF under Exodus, as most programs write it."""
-    import netCDF4
+def _exodus(format: str, **filters) -> Callable[[Path], None]:
+    """As most programs write Exodus: a variable for each coordinate, and a side set."""
 
-    with tempfile.TemporaryDirectory() as folder:
-        _by_meshio("exodus")(Path(folder) / "a.e")
-        with (
-            netCDF4.Dataset(Path(folder) / "a.e") as old,
-            netCDF4.Dataset(path, "w", format="NETCDF3_64BIT_OFFSET") as new,
-        ):
-            old.set_auto_mask(False)
-            new.setncatts({name: old.getncattr(name) for name in old.ncattrs() if not name.startswith("_")})
-            for name, size in old.dimensions.items():
-                if not len(size):
-                    continue
-                new.createDimension(name, None if name == "time_step" else len(size))
-            for name, array in old.variables.items():
-                kind = "i4" if array.dtype == np.int64 else array.dtype
-                made = new.createVariable(name, kind, array.dimensions)
-                made.setncatts({key: array.getncattr(key) for key in array.ncattrs()})
-                made[:] = array[:]
-            new.createDimension("num_side_ss1", 2)
-            new.createVariable("side_ss1", "i4", ("num_side_ss1",))[:] = [1, 2]
+    def make(path: Path) -> None:
+        import netCDF4
+
+        with tempfile.TemporaryDirectory() as folder:
+            source = Path(folder) / "a.e"
+            _by_meshio("exodus")(source)
+            with netCDF4.Dataset(source) as old, netCDF4.Dataset(path, "w", format=format) as new:
+                _copy_exodus(old, new, filters)
+
+    return make
+
+
+def _copy_exodus(old, new, filters: dict) -> None:
+    old.set_auto_mask(False)
+    new.setncatts({name: old.getncattr(name) for name in old.ncattrs() if not name.startswith("_")})
+    new.setncattr("file_size", np.int32(1))  # says that they are separate
+    for name, size in old.dimensions.items():
+        if len(size):
+            new.createDimension(name, None if name == "time_step" else len(size))
+    for axis, values in zip("xyz", old.variables["coord"][:], strict=True):
+        new.createVariable(f"coord{axis}", "f8", ("num_nodes",), **filters)[:] = values
+    for name, array in old.variables.items():
+        if name == "coord":
+            continue
+        kind = "i4" if array.dtype == np.int64 else array.dtype
+        made = new.createVariable(name, kind, array.dimensions)
+        made.setncatts({key: array.getncattr(key) for key in array.ncattrs()})
+        made[:] = array[:]
+    new.createDimension("num_side_ss1", 2)
+    new.createVariable("side_ss1", "i4", ("num_side_ss1",))[:] = [1, 2]
 
 
 def _time_series(path: Path) -> None:
@@ -296,7 +306,9 @@ MAKERS: dict[str, Callable[[Path], None]] = {
     "meshio-series.xdmf": _time_series,
     "meshio.med": _by_meshio("med"),
     "meshio-netcdf4.e": _by_meshio("exodus"),
-    "netcdf3.exo": _classic_exodus,
+    "netcdf3.exo": _exodus("NETCDF3_64BIT_OFFSET"),
+    "netcdf4-separate.e": _exodus("NETCDF4"),
+    "netcdf4-compressed.e": _exodus("NETCDF4", zlib=True, shuffle=True, fletcher32=True),
     "meshio-zlib.vtu": _by_meshio("vtu"),
     "vtk-ascii.vtu": _by_vtk(**_XML),
     "vtk-base64.vtu": _by_vtk(**_BINARY, **_NONE),

@@ -38,9 +38,12 @@ def replace_array(content: bytes, path: str, values: np.ndarray) -> bytes:
         array = file[path]
         if array.shape != values.shape or array.dtype.kind != "f":
             raise UnpatchableError(f"its array {path} is {list(array.shape)} of {array.dtype}")
+        before = array[()]
+        if np.array_equal(before, values.astype(array.dtype)):
+            return content
         offset, size = array.id.get_offset(), array.dtype.itemsize * values.size
         data = values.astype(array.dtype).tobytes()
-        if offset is not None and content[offset : offset + size] == array[()].tobytes():
+        if offset is not None and content[offset : offset + size] == before.tobytes():
             return content[:offset] + data + content[offset + size :]
         array[...] = values
     return buffer.getvalue()
