@@ -124,12 +124,14 @@ def _smooth(options: argparse.Namespace, outputs: Outputs) -> int:
     with clock("smooth"):
         result = _run(file, method, options.steps, constraints, lambda row: report.print_step(out, row))
     with clock("write"):
-        write_to(outputs, options.output, file, result, force=options.force)
+        said = write_to(outputs, options.output, file, result, force=options.force)
+    late = tuple(note for note in said if note not in notes)  # on the coordinates themselves
+    _print_losses(out, late, options.output)
     report.print_comparison(out, file.mesh, result)
     if options.report is not None:
         outputs.text(options.report, report.html_page(Path(options.input).name, file.mesh, result))
     if options.json is not None:
-        notes, seconds = (*file.notes, *notes), clock.split()
+        notes, seconds = (*file.notes, *notes, *late), clock.split()
         row = report.as_json(options.input, options.output, options.method, result, seconds, notes)
         _write_json(outputs, options.json, row)
     inverted = result.history[-1].statistics.inverted
@@ -209,8 +211,8 @@ def _demo(options: argparse.Namespace, outputs: Outputs) -> int:
 
 
 def _check_before_smoothing(options: argparse.Namespace) -> None:
+    from jaxsmooth.files.formats.table import format_of_suffix
     from jaxsmooth.files.io import check_output
-    from jaxsmooth.files.reading import format_of_suffix
 
     _check_run_options(options)
     check_output(options.output, options.input, force=options.force)

@@ -1,5 +1,6 @@
 """Damaged files: refused in one sentence, or read as the whole file is; nothing is lost in silence."""
 
+import dataclasses
 import importlib.util
 
 import jax
@@ -52,6 +53,11 @@ def solid():
     )
 
 
+def anew(file):
+    """The file without its bytes, so that it is written by the format's writer."""
+    return dataclasses.replace(file, original=None)
+
+
 FORMATS = {
     "vtu": ".vtu",
     "vtk:ascii": ".vtk",
@@ -73,6 +79,7 @@ FORMATS = {
     "xdmf": ".xdmf",
     "exodus": ".e",
     "netgen": ".vol",
+    "unv": ".unv",
 }
 NEEDS = {"xdmf": "h5py", "exodus": "netCDF4"}
 
@@ -149,6 +156,19 @@ EDITS = [
     ("medit", "\nEnd\n", "\n", "keyword End"),
     ("ugrid", "15 8 4 0", "15 8 5 0", "counts need"),
     ("nastran", "ENDDATA", "", "ENDDATA"),
+    ("unv", "    -1\n  2412", "  2412", "line of -1"),
+    (
+        "unv",
+        "7         3\n         7         8        11\n",
+        "7         3\n         7         8\n",
+        "equally|six",
+    ),
+    (
+        "unv",
+        "\n         7         8        11\n",
+        "\n         7         8        77\n",
+        "refers to node 77, which",
+    ),
     ("abaqus", "15 nodes, 16 elements", "15 nodes, 17 elements", "has 15 nodes, 16 elements and says"),
 ]
 

@@ -7,6 +7,7 @@ import jax
 import meshio
 import numpy as np
 import pytest
+from test_files_damage import anew
 
 import jaxsmooth as js
 from jaxsmooth.convert.meshfile import from_meshio
@@ -82,7 +83,7 @@ def test_materials_survive_in_other_formats(tmp_path, name, suffix):
             pytest.importorskip(package)
     file = read(DATA / name)
     path = tmp_path / ("a." + suffix.replace("42", ""))
-    write(path, file, file_format="vtk42" if suffix == "vtk42" else None)
+    write(path, anew(file), file_format="vtk42" if suffix == "vtk42" else None)
     again = read(path)
     assert np.array_equal(interface(again.mesh), interface(file.mesh))
     assert not [key for key in again.source.cell_data if "bounding" in key]
@@ -90,7 +91,7 @@ def test_materials_survive_in_other_formats(tmp_path, name, suffix):
 
 def test_all_groups_of_an_entity_are_written_again(tmp_path):
     file = read(DATA / "22_groups_last_4.1.msh")
-    write(tmp_path / "a.msh", file)
+    write(tmp_path / "a.msh", anew(file))
     again = read(tmp_path / "a.msh")
     assert {k: v.tolist() for k, v in again.named_sets.items()} == {
         k: v.tolist() for k, v in file.named_sets.items()
@@ -239,7 +240,7 @@ def test_sections_say_the_materials(tmp_path, sections, expected):
     path.write_text(INP + "".join(f"*{card}\n" for card in sections))
     file = read(path)
     assert regions(file.mesh) == expected
-    write(tmp_path / "b.inp", file)
+    write(tmp_path / "b.inp", anew(file))
     assert regions(read(tmp_path / "b.inp").mesh) == expected
     text = (tmp_path / "b.inp").read_text()
     assert text.count(" SECTION") == len(sections)
@@ -264,7 +265,7 @@ def test_tags_are_known_by_any_spelling(tmp_path, key, suffix):
     tags = 4.0 + (np.arange(16) % 4 < 2)  # VTK's writers like floats
     write(tmp_path / "a.vtu", from_meshio(squares(cell_data={key: [tags], "other": [np.arange(16)]})))
     file = read(tmp_path / "a.vtu")
-    write(tmp_path / f"a.{suffix}", file)
+    write(tmp_path / f"a.{suffix}", anew(file))
     again = np.concatenate(read(tmp_path / f"a.{suffix}").mesh.labels.regions)
     assert len(np.unique(again)) == 2
     if suffix in ("mesh", "msh"):
@@ -292,7 +293,7 @@ def test_exodus_has_a_block_for_each_type_and_material(tmp_path):
     again = read(tmp_path / "a.e")
     assert [len(c) for c in again.source.cells] == [8, 8]
     assert len(np.unique(again.mesh.labels.regions[0])) == 2
-    write(tmp_path / "b.e", again)
+    write(tmp_path / "b.e", anew(again))
     assert [len(c) for c in read(tmp_path / "b.e").source.cells] == [8, 8]
 
 

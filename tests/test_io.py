@@ -10,11 +10,14 @@ import jax
 import meshio
 import numpy as np
 import pytest
+from test_files_damage import anew
 
 import jaxsmooth.files.io as jsio
 from jaxsmooth.cells.table import element_type, supported
 from jaxsmooth.convert.meshfile import from_meshio
 from jaxsmooth.files.formats.exodus import EXODUS_ORDER, extend_exodus
+from jaxsmooth.files.formats.mshtypes import in_gmsh_order
+from jaxsmooth.files.formats.table import FORMATS
 from jaxsmooth.files.io import MeshFileError, check_output, read, write
 
 needs_h5py = pytest.mark.skipif(importlib.util.find_spec("h5py") is None, reason="needs h5py")
@@ -150,6 +153,29 @@ def test_formats_of_linear_elements(tmp_path, name, suffix):
         assert np.array_equal(again.mesh.labels.regions[0], [4, 4, 4])
 
 
+@pytest.mark.parametrize("name", [n for n in ALL if n in FORMATS["unv"].holds.types])
+def test_universal_files(tmp_path, name):
+    source = sample(name)
+    source.cell_data = {"material": [np.array([4, 5, 4])]}
+    source.point_sets = {"support": np.array([0, 2])}
+    source.cell_sets = {"steel": [np.array([0, 2])]}
+    file, again, notes = round_trip(tmp_path, source, "a.unv")
+    assert "not written: u, v" in notes[0]
+    assert list(again.mesh.labels.regions[0]) == [4, 5, 4]
+    for key in ("support", "steel"):
+        assert np.array_equal(again.named_sets[key], file.named_sets[key])
+    gmsh = pytest.importorskip("gmsh")
+    gmsh.initialize(interruptible=False)
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.merge(str(tmp_path / "a.unv"))
+        _, _, (nodes,) = gmsh.model.mesh.getElements()
+        expected = in_gmsh_order(name, source.cells[0].data) + 1
+        assert sorted(nodes.reshape(expected.shape).tolist()) == sorted(expected.tolist())
+    finally:
+        gmsh.finalize()
+
+
 @needs_netcdf
 @pytest.mark.parametrize("name", ALL)
 def test_exodus(tmp_path, name):
@@ -207,7 +233,7 @@ def test_format_and_version_stay(tmp_path, file_format):
     write(tmp_path / name, from_meshio(sample("tetra")), file_format=file_format)
     file = read(tmp_path / name)
     assert file.format == file_format
-    write(tmp_path / f"again-{name}", file)
+    write(tmp_path / f"again-{name}", anew(file))
     assert read(tmp_path / f"again-{name}").format == file_format
 
 
@@ -317,7 +343,7 @@ def test_gmsh41_keeps_entities_groups_and_names(tmp_path, mode):
     path = tmp_path / "a.msh"
     path.write_text(GMSH41)
     file = read(path)
-    write(tmp_path / "b.msh", file, file_format=f"gmsh:{mode}")
+    write(tmp_path / "b.msh", anew(file), file_format=f"gmsh:{mode}")
     again = read(tmp_path / "b.msh")
     assert same_cells(file.mesh, again.mesh)
     assert {k: set(np.flatnonzero(v)) for k, v in again.named_sets.items()} == {
@@ -454,7 +480,7 @@ def test_xdmf_with_its_data_in_hdf5(tmp_path):
     meshio.write(tmp_path / "a.xdmf", sample("tetra", "hexahedron"))
     file = read(tmp_path / "a.xdmf")
     os.remove(tmp_path / "a.h5")
-    write(tmp_path / "b.xdmf", file)
+    write(tmp_path / "b.xdmf", anew(file))
     assert same_cells(read(tmp_path / "b.xdmf").mesh, file.mesh)
     assert not (tmp_path / "b.h5").exists()
 
@@ -510,7 +536,7 @@ def test_abaqus_sets_types_and_numbers(tmp_path):
     }
     assert [list(r) for r in file.mesh.labels.regions] == [[1], [0, 0]]
     assert any("*MATERIAL" in note for note in file.notes)
-    write(tmp_path / "b.inp", file)
+    write(tmp_path / "b.inp", anew(file))
     again = {name: list(np.flatnonzero(mask)) for name, mask in read(tmp_path / "b.inp").named_sets.items()}
     assert again == sets
 
@@ -548,7 +574,7 @@ def test_avs_files_called_inp(tmp_path):
     meshio.write(tmp_path / "a.inp", meshio.Mesh(*sample_cells("tetra")), file_format="avsucd")
     file = read(tmp_path / "a.inp")
     assert file.format == "avsucd"
-    write(tmp_path / "b.inp", file)
+    write(tmp_path / "b.inp", anew(file))
     assert read(tmp_path / "b.inp").format == "avsucd"
 
 
@@ -593,7 +619,7 @@ def test_medit_counts_on_the_line_of_the_keyword(tmp_path):
             "RequiredVertices": [3],
         }
         assert any("RequiredTriangles" in note for note in file.notes)
-        write(tmp_path / "b.mesh", file)
+        write(tmp_path / "b.mesh", anew(file))
         assert read(tmp_path / "b.mesh").named_sets.keys() == file.named_sets.keys()
 
 

@@ -20,7 +20,6 @@ from meshes import grid
 import jaxsmooth as js
 from jaxsmooth.cli import main
 from jaxsmooth.convert.meshfile import MeshFileError
-from jaxsmooth.files import exports
 from jaxsmooth.report import report as reports
 from jaxsmooth.runs import driver as smoothing
 
@@ -199,7 +198,7 @@ def test_what_a_format_needs_is_asked_before_the_work(part, out, capsys, monkeyp
 def test_what_a_writer_refuses_is_known_before_the_work(part, out, capsys, monkeypatch):
     monkeypatch.setattr(smoothing, "smooth", raising(AssertionError("the work has begun")))
     monkeypatch.setattr(meshio, "write", raising(ValueError("no place for this")))
-    assert run("smooth", part, out / "a.vtu") == 2
+    assert run("smooth", part, out / "a.vtk") == 2
     one_sentence(capsys, "no place for this")
     assert content(out) == {}
 
@@ -283,7 +282,7 @@ def test_a_full_disk(part, out, capsys):
 STAGES = {
     "reading": ("jaxsmooth.files.io.read", False),
     "smoothing": ("jaxsmooth.report.report.print_step", False),
-    "writing the mesh": ("meshio.write", False),
+    "writing the mesh": ("jaxsmooth.files.io.patch_file", False),
     "making the report": ("jaxsmooth.report.report.html_page", False),
     "printing the table": ("jaxsmooth.report.report.print_comparison", False),
     "saying so": ("jaxsmooth.cli._finish", True),
@@ -352,7 +351,7 @@ def test_interrupts_that_callbacks_would_swallow(part, out):
             JaxRuntimeError("RESOURCE_EXHAUSTED: allocating 9 bytes."),
         ),
         ("jaxsmooth.runs.driver.smooth", JaxRuntimeError("INTERNAL: std::bad_alloc")),
-        ("meshio.write", np._core._exceptions._ArrayMemoryError((9,), np.dtype(float))),
+        ("jaxsmooth.files.io.patch_file", np._core._exceptions._ArrayMemoryError((9,), np.dtype(float))),
         ("meshio.vtu.read", MemoryError()),
     ],
     ids=["python", "jax", "c++", "writing", "reading"],
@@ -367,8 +366,7 @@ def test_out_of_memory(name, error, part, out, capsys, monkeypatch):
 
 
 def test_errors_of_the_program_keep_their_traceback(part, out, monkeypatch):
-    monkeypatch.setattr(exports, "write_source", raising(TypeError("a bug")))
-    monkeypatch.setattr("jaxsmooth.files.io.write_source", raising(TypeError("a bug")))
+    monkeypatch.setattr("jaxsmooth.files.io.patch_file", raising(TypeError("a bug")))
     with pytest.raises(TypeError, match="a bug"):
         smooth_three(part, out)
     assert list(out.iterdir()) == []

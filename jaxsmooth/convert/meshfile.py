@@ -28,6 +28,7 @@ from jaxsmooth.convert.checks import (
 )
 from jaxsmooth.convert.coupling import find_coupled
 from jaxsmooth.convert.labels import held_nodes, make_labels, make_named_sets, plain
+from jaxsmooth.convert.original import Original
 from jaxsmooth.convert.planes import Plane, find_plane
 from jaxsmooth.mesh.layers import STRETCHED, boundary_layers, stretched
 from jaxsmooth.mesh.record import Mesh
@@ -53,6 +54,8 @@ class MeshFile:
             the element there of each of its cells (−1: none).
         plane: for a plane mesh whose file has three coordinates a node, where in space it lies:
             `mesh.points` are coordinates in this plane.  None otherwise.
+        original: the file as it was read, so that it can be written again with nothing but its coordinates
+            changed; None if there is none.
     """
 
     mesh: Mesh
@@ -64,6 +67,7 @@ class MeshFile:
     named_sets: Mapping[str, np.ndarray]
     placement: tuple[tuple[int, np.ndarray], ...] = field(repr=False)
     plane: Plane | None = field(default=None, repr=False)
+    original: Original | None = field(default=None, repr=False)
 
 
 def from_meshio(

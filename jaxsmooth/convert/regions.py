@@ -47,6 +47,7 @@ REGION_NAMES = (
     "netgen:index",
     "tetgen:ref",
     "ugrid:ref",
+    "unv:property",
     "avsucd:material",
     "flac3d:group",
     "cell_tags",

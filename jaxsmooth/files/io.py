@@ -12,8 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from jaxsmooth.convert.meshfile import MeshFile, MeshFileError, from_meshio, to_meshio
+from jaxsmooth.convert.original import Original
+from jaxsmooth.files.formats.record import Patched, UnpatchableError, stem_format
+from jaxsmooth.files.formats.table import format_of_suffix
 from jaxsmooth.files.outputs import Outputs
-from jaxsmooth.files.reading import MissingFileError, format_of_suffix, read_source, stem_format
+from jaxsmooth.files.patching import patch_file
+from jaxsmooth.files.reading import MissingFileError, read_source
 from jaxsmooth.files.writing import check_types, write_source
 
 __all__ = [
@@ -32,7 +36,8 @@ __all__ = [
 def read(path: str | Path, *, dtype: Any = None) -> MeshFile:
     """Read a mesh file, by its suffix and its first bytes.
 
-    All formats that meshio reads, and ``.npz`` archives with ``points`` and one array a cell type.
+    All formats that meshio reads, universal files, and ``.npz`` archives with ``points`` and one array a cell
+    type.  The file's bytes are kept, or read again if there are more than 64 MiB of them, for `write`.
 
     Args:
         path: the file.
@@ -51,7 +56,7 @@ def read(path: str | Path, *, dtype: Any = None) -> MeshFile:
         file = from_meshio(source, path=path, format=name, dtype=dtype)
     except MeshFileError as error:
         raise MeshFileError(f"{path}: {error}") from error
-    return dataclasses.replace(file, notes=(*notes, *file.notes))
+    return dataclasses.replace(file, notes=(*notes, *file.notes), original=Original.of(path, source))
 
 
 def write(
@@ -65,6 +70,10 @@ def write(
     point_data: Mapping[str, Any] | None = None,
 ) -> tuple[str, ...]:
     """Write a file that was read, with other coordinates.
+
+    In the format of the input the output is the input, byte for byte, with other coordinates in it, so that
+    also what this package knows nothing of is kept.  A note says where that is not possible; it is not
+    with `cell_data` and `point_data`.  In another format, and then too, the mesh is written anew.
 
     The output is complete or not there: it is written beside its target and renamed.  A link is written
     through to its target; a file that is replaced gives its mode to the new one.
@@ -118,9 +127,22 @@ def write_to(
     for attribute in ("mesh", "points"):
         points = getattr(points, attribute, points)
     mesh = to_meshio(file, points, point_data=point_data, cell_data=cell_data)
+    patched, notes = None, []
+    if not point_data and not cell_data:
+        try:
+            patched = patch_file(file, mesh.points, path, name)
+        except UnpatchableError as error:
+            notes.append(
+                f"{path.name} is written anew, without what is neither mesh, nor data, nor sets, because "
+                f"the input can't be copied with other coordinates: {error}"
+            )
     try:
         with outputs.file(path) as part:
-            notes = write_source(part, mesh, name, file.mesh.dim)
+            if patched is None:
+                notes += write_source(part, mesh, name, file.mesh.dim)
+            else:
+                _write_patched(outputs, part, patched)
+                notes += patched.notes
     except MeshFileError as error:
         if isinstance(error.__cause__, OSError):  # not for the format to help: a full disk, say
             raise _unwritable(path, error.__cause__) from error
@@ -128,6 +150,14 @@ def write_to(
     except OSError as error:
         raise _unwritable(path, error) from error
     return tuple(notes)
+
+
+def _write_patched(outputs: Outputs, part: Path, patched: Patched) -> None:
+    part.write_bytes(patched.content)
+    for name, content in patched.companions.items():
+        (part.parent / name).write_bytes(content)
+    for path in patched.inputs:
+        outputs.protect(path)
 
 
 def _unwritable(path: Any, error: OSError) -> MeshFileError:

@@ -16,25 +16,30 @@ from jaxsmooth.convert.regions import (
     recall,
     region_arrays,
 )
+from jaxsmooth.files.formats.record import Format, Holds
 
 __all__ = [
-    "DATA_FORMATS",
+    "BLOCKWISE",
     "GMSH_TAGS",
-    "VTK_FORMATS",
+    "UNKEPT",
     "add_materials",
     "as_tags",
+    "data_to_sets",
+    "keep_boundary_tags",
     "material_name",
-    "reduce_data",
+    "sets_as_masks",
     "sets_to_data",
 ]
 
-VTK_FORMATS = {"vtk", "vtk42", "vtu"}
-DATA_FORMATS = {*VTK_FORMATS, "xdmf", "gmsh", "gmsh22", "npz"}
-"""Formats that hold any point and cell data."""
-
 GMSH_TAGS = ("gmsh:physical", "gmsh:geometrical")
 _FOLDED = {folded(name) for name in REGION_NAMES}
-_OWN_TAGS = {"medit": "medit:ref", "su2": "su2:tag", "ugrid": "ugrid:ref"}
+
+UNKEPT = "files:unkept"
+"""In `meshio.Mesh.info`: what is lost when a file is written anew, pairs of the format whose writer has room
+for it (``""``: none) and what it is."""
+
+BLOCKWISE = ("abaqus:types",)
+"""In `meshio.Mesh.info`: lists with an entry a cell block, beside `SECTIONS`."""
 
 
 def material_name(mesh: meshio.Mesh, dim: int) -> str | None:
@@ -48,7 +53,7 @@ def material_name(mesh: meshio.Mesh, dim: int) -> str | None:
     return only
 
 
-def add_materials(mesh: meshio.Mesh, stem: str, dim: int, notes: list[str]) -> None:
+def add_materials(mesh: meshio.Mesh, holds: Holds, dim: int, notes: list[str]) -> None:
     """Materials that sections or sets give become cell data, for other formats have only those."""
     top = [k for k, cells in enumerate(mesh.cells) if cells.dim == dim]
     cells = [(c.type, c.data) for c in mesh.cells]
@@ -70,7 +75,7 @@ def add_materials(mesh: meshio.Mesh, stem: str, dim: int, notes: list[str]) -> N
     first = 1 - min(int(joined.min()), 1)
     zero = [np.zeros(len(c), np.int64) for c in mesh.cells]
     mesh.cell_data[name] = [parts[k] + first if k in parts else zero[k] for k in range(len(cells))]
-    if stem in DATA_FORMATS:
+    if holds.any_data:
         notes.append(f"materials that sections or sets give are written as the cell data {name!r}")
 
 
@@ -79,7 +84,7 @@ def as_tags(parts) -> list[np.ndarray]:
     return [np.nan_to_num(np.asarray(part, float).reshape(-1)).astype(np.int64) for part in parts]
 
 
-def _masks(mesh: meshio.Mesh) -> tuple[dict[str, np.ndarray], dict[str, list[np.ndarray]]]:
+def sets_as_masks(mesh: meshio.Mesh) -> tuple[dict[str, np.ndarray], dict[str, list[np.ndarray]]]:
     """All sets as 0/1 data: of points, and of cells (cell sets and Gmsh's physical names)."""
     of_points, of_cells = {}, {}
     for name, members in mesh.point_sets.items():
@@ -104,19 +109,26 @@ def _masks(mesh: meshio.Mesh) -> tuple[dict[str, np.ndarray], dict[str, list[np.
     return of_points, of_cells
 
 
-def sets_to_data(mesh: meshio.Mesh, stem: str, notes: list[str]) -> None:
-    """Turn sets into 0/1 data under their names; Gmsh keeps its physical names as they are."""
-    of_points, of_cells = _masks(mesh)
-    if stem in ("gmsh", "gmsh22"):
+def sets_to_data(mesh: meshio.Mesh, record: Format, notes: list[str]) -> None:
+    """Turn sets that the format has no place for into 0/1 data under their names.
+
+    Those whose names are in `Holds.sets` stay, and named groups where it has them (`Holds.groups`)."""
+    own, stem = record.holds.sets, record.name
+    if own is True or not (mesh.point_sets or mesh.cell_sets or mesh.field_data):
+        return
+    kept = {} if own is False else {k: v for k, v in mesh.point_sets.items() if k in own}
+    mesh.point_sets = {name: v for name, v in mesh.point_sets.items() if name not in kept}
+    of_points, of_cells = sets_as_masks(mesh)
+    if record.holds.groups:
         of_cells = {name: masks for name, masks in of_cells.items() if name not in mesh.field_data}
     else:
         mesh.field_data = {}
-    mesh.point_sets = {}
+    mesh.point_sets = kept
     mesh.cell_sets = {k: v for k, v in mesh.cell_sets.items() if k in NOT_SETS or k in mesh.field_data}
     names = [*of_points, *of_cells]
     if not names:
         return
-    if stem not in DATA_FORMATS:
+    if not record.holds.any_data:
         notes.append(f"{stem} files hold no named sets; not written: {', '.join(names)}")
         return
     for name, mask in of_points.items():
@@ -132,58 +144,27 @@ def _free(name: str, taken) -> str:
     return name
 
 
-def reduce_data(mesh: meshio.Mesh, stem: str, dim: int, notes: list[str]) -> None:
-    """Keep what formats without free data can hold: material tags, and sets where there are some."""
-    lost = [*mesh.point_data, *mesh.cell_data]
-    if stem == "abaqus":
-        lost = _data_to_sets(mesh)
-    elif stem == "exodus":
-        name = material_name(mesh, dim)
-        lost = [other for other in mesh.cell_data if other != name]
-        mesh.cell_data = {name: as_tags(mesh.cell_data[name])} if name else {}
-        lost += [name for name in (*mesh.cell_sets, *mesh.field_data) if name not in NOT_SETS]
-    elif stem in _OWN_TAGS:
-        lost = _keep_tags(mesh, stem, dim)
-    else:  # meshio knows best; what it leaves out differs from format to format
-        if name := material_name(mesh, dim):  # it takes the first whole numbers, or those of its own name
-            tags = as_tags(mesh.cell_data.pop(name))
-            mesh.cell_data = {"nastran:ref" if stem == "nastran" else name: tags, **mesh.cell_data}
-        return
-    lost = [n for n in lost if n != "gmsh:dim_tags"]
-    if lost:
-        notes.append(f"{stem} files can't hold these data, which are not written: {', '.join(lost)}")
+def keep_boundary_tags(
+    mesh: meshio.Mesh, dim: int, own: str, of_boundary: int
+) -> tuple[list[str], str | None]:
+    """Leave the tags of boundary cells (of dimension `of_boundary`) under the name `own`, and no other data.
 
-
-def _keep_tags(mesh: meshio.Mesh, stem: str, dim: int) -> list[str]:
-    """Leave the tags that a format has for its cells; returns the names of data that it can't hold."""
-    lost, named, own = [*mesh.point_data, *mesh.cell_data], _masks(mesh)[1], _OWN_TAGS[stem]
-    material = material_name(mesh, dim)
-    name = material
-    if stem != "medit":  # tags of boundary cells only
-        of_boundary = dim - 1 if stem == "su2" else 2
-        blocks = [k for k, cells in enumerate(mesh.cells) if cells.dim == of_boundary]
-        tagged = [n for n, tags in region_arrays(mesh, blocks) if any(t.any() for t in tags.values())]
-        name = own if own in tagged else next(iter(tagged), None)
-        if of_boundary == dim and own not in tagged:  # plane meshes in .ugrid
-            name = material
-    lost = [n for n in lost if n not in (name, "medit:ref")]
-    if name and name == material and stem == "su2":
-        lost.append(f"{name} of the elements")
+    Returns the names of data that are lost, and the one whose tags are left."""
+    lost, material = [*mesh.point_data, *mesh.cell_data], material_name(mesh, dim)
+    blocks = [k for k, cells in enumerate(mesh.cells) if cells.dim == of_boundary]
+    tagged = [n for n, tags in region_arrays(mesh, blocks) if any(t.any() for t in tags.values())]
+    name = own if own in tagged else next(iter(tagged), None)
+    if of_boundary == dim and own not in tagged:  # plane meshes in .ugrid
+        name = material
     mesh.cell_data = {own: as_tags(mesh.cell_data[name])} if name else {}
-    values = integers(mesh.point_data["medit:ref"]) if "medit:ref" in mesh.point_data else None
-    mesh.point_data = {"medit:ref": values} if stem == "medit" and values is not None else {}
-    if stem == "su2":  # markers are cell sets of the boundary
-        mesh.cell_sets = {n: [np.flatnonzero(m) for m in ms] for n, ms in named.items()}
-        top = [k for k, cells in enumerate(mesh.cells) if cells.dim == dim]
-        lost += [n for n, ms in mesh.cell_sets.items() if any(len(ms[k]) for k in top)]
-        lost += list(mesh.point_sets)
-    return lost
+    mesh.point_data = {}
+    return [n for n in lost if n not in (name, "medit:ref")], name
 
 
-def _data_to_sets(mesh: meshio.Mesh) -> list[str]:
+def data_to_sets(mesh: meshio.Mesh, dim: int) -> list[str]:
     """Masks and material tags become sets; returns the names of data that can't."""
     lost = []
-    _, named = _masks(mesh)
+    _, named = sets_as_masks(mesh)
     mesh.cell_sets = {name: [np.flatnonzero(mask) for mask in masks] for name, masks in named.items()}
     for name, values in mesh.point_data.items():
         if is_mask(values):

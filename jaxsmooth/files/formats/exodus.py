@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 
 import meshio
 import numpy as np
+from jaxtyping import Float
 
-from jaxsmooth.cells.table import element_type
+from jaxsmooth.cells.table import element_type, supported
+from jaxsmooth.convert.regions import NOT_SETS
+from jaxsmooth.files.formats.hdf5 import is_hdf5, replace_array
+from jaxsmooth.files.formats.record import Format, Holds, Patched, Source
+from jaxsmooth.files.numbers import check_columns, check_old
+from jaxsmooth.files.reduction import as_tags, material_name
 
-__all__ = ["EXODUS_BLOCKS", "EXODUS_ORDER", "extend_exodus", "read_exodus", "write_exodus"]
+__all__ = ["EXODUS", "EXODUS_BLOCKS", "EXODUS_ORDER", "extend_exodus", "read_exodus", "write_exodus"]
 
 
-def read_exodus(path: Path) -> meshio.Mesh:
+def read_exodus(path: Path) -> tuple[meshio.Mesh, list[str]]:
     """An Exodus file; its element blocks are materials.
 
     Exodus has its own order of mid-side nodes; meshio leaves it, and writes VTK's.  Files of both kinds
@@ -30,17 +37,25 @@ def read_exodus(path: Path) -> meshio.Mesh:
             mesh.cells[k] = meshio.CellBlock(cells.type, turned)
     numbers = [np.full(len(cells), k + 1) for k, cells in enumerate(mesh.cells)]
     mesh.cell_data.setdefault(EXODUS_BLOCKS, numbers)
-    return mesh
+    return mesh, []
 
 
-def write_exodus(path: Path, mesh: meshio.Mesh, name: str | None) -> None:
-    """Write a mesh; `name` is that of its material tags, or None.
+def _reduce(mesh: meshio.Mesh, dim: int) -> list[str]:
+    name = material_name(mesh, dim)
+    lost = [other for other in mesh.cell_data if other != name]
+    mesh.cell_data = {name: as_tags(mesh.cell_data[name])} if name else {}
+    return lost + [name for name in (*mesh.cell_sets, *mesh.field_data) if name not in NOT_SETS]
+
+
+def write_exodus(path: Path, mesh: meshio.Mesh, dim: int, variant: str = "") -> list[str]:
+    """Write a mesh; its first cell data are its material tags.
 
     Cells of one type and one material are one block.  The tags are an element variable, too: a material
     with elements of two types is two blocks."""
     import netCDF4
 
     extend_exodus()
+    name = next(iter(mesh.cell_data), None)
     tags = mesh.cell_data[name] if name else [np.zeros(len(cells), np.int64) for cells in mesh.cells]
     blocks, values = [], []
     for kind in dict.fromkeys(cells.type for cells in mesh.cells):
@@ -54,7 +69,7 @@ def write_exodus(path: Path, mesh: meshio.Mesh, name: str | None) -> None:
     plain = meshio.Mesh(mesh.points, blocks, point_data=mesh.point_data, point_sets=mesh.point_sets)
     meshio.write(path, plain, file_format="exodus")
     if name is None:
-        return
+        return []
     with netCDF4.Dataset(path, "a") as out:
         out.createDimension("num_elem_var", 1)
         names = out.createVariable("name_elem_var", "S1", ("num_elem_var", "len_string"))
@@ -66,6 +81,7 @@ def write_exodus(path: Path, mesh: meshio.Mesh, name: str | None) -> None:
                 f"vals_elem_var1eb{k + 1}", "f8", ("time_step", f"num_el_in_blk{k + 1}")
             )
             variable[0] = np.full(len(cells), float(value))
+    return []
 
 
 def extend_exodus() -> None:
@@ -107,3 +123,43 @@ _EXODUS_NAMES = {
     "WEDGE15": "wedge15",
     "WEDGE18": "wedge18",
 }
+
+
+def patch_exodus(
+    source: Source, old: Float[np.ndarray, "nodes dim"], new: Float[np.ndarray, "nodes dim"]
+) -> Patched:
+    """The file with other coordinates: ``coordx``, ``coordy``, ``coordz``, or all of them in ``coord``."""
+    import netCDF4
+
+    content = source.content
+    with netCDF4.Dataset("memory", memory=content) as file:
+        file.set_auto_mask(False)
+        names = [name for name in ("coordx", "coordy", "coordz", "coord") if name in file.variables]
+        found = np.concatenate([np.atleast_2d(file.variables[name][:]) for name in names]).T
+    check_old(found, old)
+    check_columns(found.shape[1], old, new)
+    values = (
+        dict(zip(names, new.T, strict=False)) if names != ["coord"] else {"coord": new.T[: found.shape[1]]}
+    )
+    if is_hdf5(content):
+        for name, array in values.items():
+            content = replace_array(content, name, array)
+        return Patched(content)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "mesh.e"
+        path.write_bytes(content)
+        with netCDF4.Dataset(path, "r+") as file:
+            for name, array in values.items():
+                file.variables[name][:] = array
+        return Patched(path.read_bytes())
+
+
+EXODUS = Format(
+    "exodus",
+    (".e", ".exo", ".ex2"),
+    read_exodus,
+    write_exodus,
+    Holds(types=frozenset({"vertex", "line", "line3", *supported()}), sets=True, reduce=_reduce),
+    needs="netCDF4",
+    patch=patch_exodus,
+)

@@ -1,7 +1,9 @@
 """Gmsh's .msh files where meshio (5.3.5) falls short: repairs before it reads, and a 4.1 writer.
 
 - 2.2: data of cells are split wrongly between blocks, so they are read here.
-- 4.1: entities without a physical group beside others with one make meshio refuse the file, so
+- 4.0: its first lines say 4, which meshio takes for 4.1.
+- 4.x: nodes with parametric coordinates are refused, so those are left out; it knows no partitions.
+- 4.x: entities without a physical group beside others with one make meshio refuse the file, so
   those get the group 0, which is how meshio says "none".
 - 4.1 written by meshio can't be read again when an entity has no nodes of its own, when one has
   cells of two types, or when the source wasn't 4.1; hence the writer here.
@@ -11,19 +13,21 @@
 from __future__ import annotations
 
 import copy
+import io
 import re
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 import meshio
 import numpy as np
-from meshio.gmsh.common import _gmsh_to_meshio_order, _meshio_to_gmsh_order, _meshio_to_gmsh_type
 
 from jaxsmooth.convert.regions import GROUPS, recall
+from jaxsmooth.files.formats.mshnodes import without_parameters
+from jaxsmooth.files.formats.mshraw import Entity, msh_format, read_entities, section_span
+from jaxsmooth.files.formats.mshtypes import CODES, in_gmsh_order
 
 __all__ = [
-    "in_gmsh_order",
-    "in_vtk_order",
     "keep_groups",
     "read_msh_data",
     "repaired_msh",
@@ -44,14 +48,15 @@ def sniff_msh(head: bytes) -> str | None:
 
 def repaired_msh(content: bytes) -> bytes:
     """The file as meshio can read it; the same object when there is nothing to repair."""
-    found = re.search(rb"\$MeshFormat\s+(\d)(?:\.(\d+))?\s+([01])\s+(\d+)", content[:4096])
-    if found is None:
+    if (found := msh_format(content)) is None:
         return content
-    if found[1] == b"2":
+    version, binary, size = found
+    if version.startswith("2"):
         return re.sub(rb"\$ElementData\r?\n.*?\$EndElementData[^\n]*\n?", b"", content, flags=re.DOTALL)
-    if found[1] == b"4" and found[2] != b"0":
-        return _with_physical_groups(content, found[3] == b"1", int(found[4]))
-    return content
+    if not version.startswith("4"):
+        return content
+    content = _with_physical_groups(without_parameters(content), binary, size)
+    return re.sub(rb"^(\$MeshFormat\s+4)(?=\s)", rb"\1.0", content, count=1)  # 4.1 to meshio
 
 
 def read_msh_data(content: bytes, mesh: meshio.Mesh) -> dict[str, list[np.ndarray]]:
@@ -90,100 +95,48 @@ def read_msh_data(content: bytes, mesh: meshio.Mesh) -> dict[str, list[np.ndarra
     return found
 
 
-def keep_groups(mesh: meshio.Mesh, groups: dict[tuple[int, int], list[int]]) -> None:
-    """Give a 4.1 mesh what meshio drops: all groups of the entities that are in several.
+def keep_groups(mesh: meshio.Mesh, entities: Sequence[Entity]) -> None:
+    """Give a mesh of version 4 what meshio drops: the entities of partitions, and all groups of an entity.
 
     ``gmsh:physical`` has room for one; the group with the fewest cells says most about them."""
+    groups = {(one.dim, one.tag): one.groups for one in entities}
     several = {key: own for key, own in groups.items() if len(own) > 1}
-    if not several or "gmsh:physical" not in mesh.cell_data:
-        return
-    entities = [
-        (c.dim, int(t[0])) for c, t in zip(mesh.cells, mesh.cell_data["gmsh:geometrical"], strict=True)
-    ]
-    sizes: dict[tuple[int, int], int] = {}
-    for key, cells in zip(entities, mesh.cells, strict=True):
-        for group in groups.get(key, ()):
-            sizes[key[0], group] = sizes.get((key[0], group), 0) + len(cells)
-    for k, key in enumerate(entities):
-        if key in several:
-            least = min(several[key], key=lambda group, dim=key[0]: sizes[dim, group])
-            mesh.cell_data["gmsh:physical"][k] = np.full(len(mesh.cells[k]), least)
-    mesh.info = {GROUPS: several}
-
-
-_VTK_ORDER = {
-    "pyramid14": [0, 1, 2, 3, 4, 5, 8, 10, 6, 7, 9, 11, 12, 13],
-    "wedge18": [0, 1, 2, 3, 4, 5, 6, 9, 7, 12, 14, 13, 8, 10, 11, 15, 17, 16],
-}
-"""Gmsh's nodes in VTK's order, of the types that meshio leaves in Gmsh's."""
-
-
-def in_vtk_order(mesh: meshio.Mesh) -> None:
-    """Put the nodes of what meshio read in VTK's order where it has not."""
-    _reorder(mesh, _VTK_ORDER)
-
-
-def in_gmsh_order(mesh: meshio.Mesh) -> None:
-    """Put the nodes in Gmsh's order where meshio's writer would not."""
-    _reorder(mesh, {name: np.argsort(order) for name, order in _VTK_ORDER.items()})
-
-
-def _reorder(mesh: meshio.Mesh, orders) -> None:
-    for k, cells in enumerate(mesh.cells):
-        if cells.type in orders:
-            count = np.arange(len(orders[cells.type]))[None]
-            if np.array_equal(_gmsh_to_meshio_order(cells.type, count), count):
-                mesh.cells[k] = meshio.CellBlock(cells.type, cells.data[:, orders[cells.type]])
+    tags = mesh.cell_data.get("gmsh:geometrical", [])
+    keys = [(cells.dim, int(own[0])) for cells, own in zip(mesh.cells, tags, strict=False)]
+    if several and "gmsh:physical" in mesh.cell_data:
+        sizes: dict[tuple[int, int], int] = {}
+        for key, cells in zip(keys, mesh.cells, strict=True):
+            for group in groups.get(key, ()):
+                sizes[key[0], group] = sizes.get((key[0], group), 0) + len(cells)
+        for k, key in enumerate(keys):
+            if key in several:
+                least = min(several[key], key=lambda group, dim=key[0]: sizes[dim, group])
+                mesh.cell_data["gmsh:physical"][k] = np.full(len(mesh.cells[k]), least)
+        mesh.info = {GROUPS: several}
+    parents = {(one.dim, one.tag): one.parent for one in entities if one.parent is not None}
+    for k, key in enumerate(keys):
+        if key in parents and parents[key][0] == key[0]:
+            tags[k] = np.full(len(mesh.cells[k]), parents[key][1])
 
 
 def _with_physical_groups(content: bytes, binary: bool, size: int) -> bytes:
-    start = content.find(b"$Entities")
-    if start < 0:
+    """Entities of partitions among the others, and the group 0 for those without beside others with one."""
+    found = read_entities(content)
+    several = len({bool(one.groups) for one in found}) > 1
+    if not found or not (several or any(one.parent for one in found)):
         return content
-    start = content.index(b"\n", start) + 1
-    if binary:
-        body, end = _binary_entities(content, start, size)
-        end = content.index(b"$EndEntities", end)
-        return content if body is None else content[:start] + body + b"\n" + content[end:]
-    end = content.index(b"$EndEntities", start)
-    lines = [line.split() for line in content[start:end].splitlines() if line.strip()]
-    counts = [int(n) for n in lines[0]]
-    grouped = []
-    for row, fields in enumerate(lines[1:]):
-        at = 4 if row < counts[0] else 7
-        grouped.append(fields[at] != b"0")
-        if not grouped[-1]:
-            fields[at : at + 1] = [b"1", b"0"]
-    if all(grouped) or not any(grouped):
-        return content
-    return content[:start] + b"\n".join(b" ".join(fields) for fields in lines) + b"\n" + content[end:]
-
-
-def _binary_entities(content: bytes, at: int, size: int) -> tuple[bytes | None, int]:
-    """The entities section with group 0 for those without; None where that isn't needed."""
-    word = {4: "<I", 8: "<Q"}[size]
-    parts, grouped = [], []
-
-    def take(length: int) -> bytes:
-        nonlocal at
-        at += length
-        return content[at - length : at]
-
-    head = take(4 * size)
-    counts = [struct.unpack_from(word, head, k * size)[0] for k in range(4)]
-    parts.append(head)
-    for dim, count in enumerate(counts):
-        for _ in range(count):
-            parts.append(take(4 + 8 * (3 if dim == 0 else 6)))
-            number = take(size)
-            groups = struct.unpack(word, number)[0]
-            grouped.append(groups > 0)
-            tags = take(4 * groups)
-            parts.append(number + tags if groups else struct.pack(word, 1) + struct.pack("<i", 0))
-            if dim:
-                number = take(size)
-                parts.append(number + take(4 * struct.unpack(word, number)[0]))
-    return (None if all(grouped) or not any(grouped) else b"".join(parts)), at
+    found = sorted({(one.dim, one.tag): one for one in found[::-1]}.values(), key=lambda one: one[:2])
+    number = f"<u{size}"
+    rows = [[(number, [sum(one.dim == dim for one in found) for dim in range(4)])]]
+    for one in found:
+        groups = one.groups or [0] * several
+        row = [("<i4", one.tag), ("<f8", one.box), (number, len(groups)), ("<i4", groups)]
+        rows.append(row + ([(number, len(one.bounds)), ("<i4", one.bounds)] if one.dim else []))
+    out = io.BytesIO()
+    _section(out, "Entities", rows, binary)
+    start, end = section_span(content, "Entities")
+    start = content.rindex(b"$Entities", 0, start)
+    return content[:start] + out.getvalue().rstrip() + content[end + len(b"$EndEntities") :]
 
 
 # --- Writing 4.1 -------------------------------------------------------------------------
@@ -246,7 +199,7 @@ def write_msh41(path: Path, mesh: meshio.Mesh, binary: bool) -> None:
     ``gmsh:geometrical``, see `split_by_entity`."""
     points = np.zeros((len(mesh.points), 3))
     points[:, : mesh.points.shape[1]] = mesh.points
-    entities = _entities(mesh, points)
+    entities = _all_entities(mesh, points)
     with open(path, "wb") as out:
         out.write(f"$MeshFormat\n4.1 {int(binary)} 8\n".encode())
         if binary:
@@ -281,7 +234,7 @@ def _section(out, name: str, rows, binary: bool) -> None:
     out.write(b"\n" * binary + f"$End{name}\n".encode())
 
 
-def _entities(mesh: meshio.Mesh, points: np.ndarray) -> dict[tuple[int, int], dict]:
+def _all_entities(mesh: meshio.Mesh, points: np.ndarray) -> dict[tuple[int, int], dict]:
     """All entities {(dim, tag): box, groups, bounds}: those of cells and those of nodes."""
     found: dict[tuple[int, int], dict] = {}
     tags = mesh.point_data.get("gmsh:dim_tags")
@@ -341,9 +294,9 @@ def _element_rows(mesh):
     yield [("<u8", [len(mesh.cells), total, 1, total])]
     first = 1
     for k, cells in enumerate(mesh.cells):
-        nodes = _meshio_to_gmsh_order(cells.type, cells.data)
+        nodes = in_gmsh_order(cells.type, cells.data)
         tag = int(mesh.cell_data["gmsh:geometrical"][k][0])
-        yield [("<i4", [cells.dim, tag, _meshio_to_gmsh_type[cells.type]]), ("<u8", len(nodes))]
+        yield [("<i4", [cells.dim, tag, CODES[cells.type]]), ("<u8", len(nodes))]
         yield [("<u8", np.column_stack([np.arange(first, first + len(nodes)), nodes.astype(np.int64) + 1]))]
         first += len(nodes)
 

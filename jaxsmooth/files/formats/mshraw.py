@@ -1,4 +1,4 @@
-"""What a Gmsh file itself says: whether it is whole, and the physical groups of its entities.
+"""What a Gmsh file itself says: whether it is whole, and its entities.
 
 meshio (5.3.5) takes sections that end early, wrong counts, and tags of nodes that aren't there; of the
 groups of an entity it keeps the first."""
@@ -7,23 +7,22 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
-from meshio._common import num_nodes_per_cell
-from meshio.gmsh.common import _gmsh_to_meshio_type
 
 from jaxsmooth.convert.checks import parse_numbers
+from jaxsmooth.files.formats.mshtypes import NODES_OF
 
-__all__ = ["check_msh", "entity_groups"]
+__all__ = ["Entity", "Section", "check_msh", "msh_format", "read_entities", "section_span"]
 
 
-class _Section:
+class Section:
     """The numbers of a section, taken from its begin to its end."""
 
     def __init__(self, content: bytes, name: str, binary: bool, size: int):
-        start = content.index(b"$" + name.encode())
         self.name, self.binary, self.size = name, binary, size
-        self.body = content[content.index(b"\n", start) + 1 : content.find(b"$End" + name.encode(), start)]
+        self.body = content[slice(*section_span(content, name))]
         self.at = 0
         if not binary:
             self.numbers = parse_numbers(self.body, f"its section ${name}")
@@ -60,16 +59,28 @@ class _Section:
 _CUT = "the file is damaged or cut short"
 
 
-def _format(content: bytes) -> tuple[str, bool, int] | None:
+def section_span(content: bytes, name: str) -> tuple[int, int]:
+    """First byte of what stands in a section, and the byte behind the last; `ValueError` without it."""
+    found = re.search(rb"^\$%s[ \t]*\r?\n" % name.encode(), content, re.M)
+    if found is None:
+        raise ValueError(f"it has no section ${name}")
+    return found.end(), content.find(b"$End" + name.encode(), found.end())
+
+
+def msh_format(content: bytes) -> tuple[str, bool, int] | None:
+    """Version, whether it is binary, and the bytes of a size; Gmsh writes 4 for 4.0."""
     found = re.search(rb"\$MeshFormat\s+(\d(?:\.\d+)?)\s+([01])\s+(\d+)", content[:4096])
-    return None if found is None else (found[1].decode(), found[2] == b"1", int(found[3]))
+    if found is None:
+        return None
+    version = found[1].decode()
+    return "4.0" if version == "4" else version, found[2] == b"1", int(found[3])
 
 
 def check_msh(content: bytes) -> None:
     """Raise `ValueError` where sections don't end, counts are wrong, or tags of nodes are not there.
 
     Knows 2.x and 4.1; of 4.0 it looks at the ends of sections only."""
-    if (found := _format(content)) is None:
+    if (found := msh_format(content)) is None:
         return
     version, binary, size = found
     for name in re.findall(rb"^\$(?!End)(\w+)[ \t]*\r?$", content, re.MULTILINE):
@@ -79,7 +90,7 @@ def check_msh(content: bytes) -> None:
         raise ValueError(f"it does not end with the end of a section; {_CUT}")
     if version == "4.0" or b"$Nodes" not in content or b"$Elements" not in content:
         return
-    nodes, elements = (_Section(content, name, binary, size) for name in ("Nodes", "Elements"))
+    nodes, elements = (Section(content, name, binary, size) for name in ("Nodes", "Elements"))
     tags = _nodes2(nodes) if version[0] == "2" else _nodes4(nodes)
     _check_tags(tags)
     whole = tags[-1] - tags[0] == len(tags) - 1 and bool((np.diff(tags) == 1).all())  # the usual case
@@ -106,7 +117,7 @@ def _check_tags(tags: np.ndarray) -> None:
         raise ValueError(f"it has two nodes with the tag {values[times > 1][0]}; {_CUT}")
 
 
-def _nodes2(section: _Section) -> np.ndarray:
+def _nodes2(section: Section) -> np.ndarray:
     count = section.line()
     if section.binary:
         table = np.dtype([("tag", "<i4"), ("x", "<f8", (3,))])
@@ -121,7 +132,7 @@ def _nodes2(section: _Section) -> np.ndarray:
     return tags
 
 
-def _elements2(section: _Section) -> Iterator[np.ndarray]:
+def _elements2(section: Section) -> Iterator[np.ndarray]:
     """Nodes of the elements, in runs of one type and one number of tags."""
     left = section.line()
     while left:
@@ -148,12 +159,12 @@ def _elements2(section: _Section) -> Iterator[np.ndarray]:
 
 
 def _nodes_of(code: int | np.integer) -> int:
-    if code not in _gmsh_to_meshio_type:
+    if int(code) not in NODES_OF:
         raise ValueError(f"elements of Gmsh's type {code} are not supported")
-    return num_nodes_per_cell[_gmsh_to_meshio_type[code]]
+    return NODES_OF[int(code)]
 
 
-def _nodes4(section: _Section) -> np.ndarray:
+def _nodes4(section: Section) -> np.ndarray:
     blocks, count = section.take(4, "n")[:2]
     found = [np.zeros(0, np.int64)]
     for _ in range(blocks):
@@ -168,7 +179,7 @@ def _nodes4(section: _Section) -> np.ndarray:
     return tags
 
 
-def _elements4(section: _Section) -> Iterator[np.ndarray]:
+def _elements4(section: Section) -> Iterator[np.ndarray]:
     blocks, count = section.take(4, "n")[:2]
     total = 0
     for _ in range(blocks):
@@ -182,19 +193,46 @@ def _elements4(section: _Section) -> Iterator[np.ndarray]:
         raise ValueError(f"its section $Elements has {total} elements and says {count}; {_CUT}")
 
 
-def entity_groups(content: bytes) -> dict[tuple[int, int], list[int]]:
-    """The physical groups of the entities ``{(dim, tag): groups}`` of a 4.1 file."""
-    found = _format(content)
-    if found is None or not found[0].startswith("4") or found[0] == "4.0" or b"$Entities" not in content:
-        return {}
-    section = _Section(content, "Entities", found[1], found[2])
-    groups = {}
+class Entity(NamedTuple):
+    """A point, curve, surface or volume of the geometry, or the part of one that is in a partition."""
+
+    dim: int
+    tag: int
+    groups: list[int]
+    box: np.ndarray
+    bounds: list[int]
+    parent: tuple[int, int] | None
+
+
+def read_entities(content: bytes) -> list[Entity]:
+    """The entities of a file of version 4, those of partitions last."""
+    found = msh_format(content)
+    if found is None or not found[0].startswith("4"):
+        return []
+    version, binary, size = found
+    return [
+        entity
+        for name in ("Entities", "PartitionedEntities")
+        if re.search(rb"^\$%s\b" % name.encode(), content, re.M)
+        for entity in _entities(Section(content, name, binary, size), version)
+    ]
+
+
+def _entities(section: Section, version: str) -> Iterator[Entity]:
+    parts, parent = section.name == "PartitionedEntities", None
+    if parts:
+        section.take(1, "n")
+        ghosts = section.take(1, "n")[0]
+        section.take(2 * ghosts)
     for dim, count in enumerate(section.take(4, "n")):
         for _ in range(count):
             tag = int(section.take(1)[0])
-            section.take(6 if dim else 3, "d")
-            groups[dim, tag] = [int(g) for g in section.take(int(section.take(1, "n")[0]))]
-            if dim:
-                section.take(int(section.take(1, "n")[0]))
+            if parts:
+                above, own = section.take(2).tolist()
+                parent = above, own
+                section.take(section.take(1, "n")[0])  # its partitions
+            box = section.take(6 if dim or version == "4.0" else 3, "d")
+            groups = section.take(section.take(1, "n")[0]).tolist()
+            bounds = section.take(section.take(1, "n")[0]).tolist() if dim else []
+            yield Entity(dim, tag, groups, box, bounds, parent)
     section.end()
-    return groups

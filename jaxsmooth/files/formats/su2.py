@@ -10,18 +10,21 @@ from pathlib import Path
 
 import meshio
 import numpy as np
+from jaxtyping import Float
 
 from jaxsmooth.cells.table import element_type
 from jaxsmooth.convert.checks import check_last_line, parse_numbers
 from jaxsmooth.convert.regions import recall
+from jaxsmooth.files.formats.record import Format, Holds, Patched, Source, UnpatchableError
+from jaxsmooth.files.numbers import Places, blanked, put_text, tokens
+from jaxsmooth.files.reduction import UNKEPT, keep_boundary_tags, material_name, sets_as_masks
 
-__all__ = ["SU2_REST", "read_su2", "write_su2"]
+__all__ = ["SU2", "read_su2", "write_su2"]
 
 _CODES = {"line": 3, "triangle": 5, "quad": 9, "tetra": 10, "hexahedron": 12, "wedge": 13, "pyramid": 14}
 _NAMES = {code: name for name, code in _CODES.items()}
 
-SU2_REST = "su2:rest"
-"""In `meshio.Mesh.info`: sections that are neither nodes, elements nor markers, as they stand."""
+_REST = "su2:rest"  # in `meshio.Mesh.info`: sections that are no mesh, as they stand
 
 _CUT = "the file is damaged or cut short"
 
@@ -63,15 +66,8 @@ def read_su2(path: Path) -> tuple[meshio.Mesh, list[str]]:
         elif key != "NZONE":
             rest += lines[start:end]
     if points is None or not dim or not {"NELEM", "NMARK"} <= counts.keys():
-        missing = (
-            "NDIME"
-            if not dim
-            else "NPOIN"
-            if points is None
-            else "NELEM"
-            if "NELEM" not in counts
-            else "NMARK"
-        )
+        have = {"NDIME": dim, "NPOIN": points is not None, "NELEM": "NELEM" in counts, "NMARK": False}
+        missing = next(name for name, there in have.items() if not there)
         raise ValueError(f"it has no section {missing}; {_CUT}")
     if counts["NMARK"] != len(markers) or not all(name in counts for name in markers):
         complete = sum(name in counts for name in markers)
@@ -79,7 +75,10 @@ def read_su2(path: Path) -> tuple[meshio.Mesh, list[str]]:
     mesh = _mesh(points, inside, outside, markers)
     notes = []
     if rest:
-        mesh.info = {SU2_REST: "\n".join(rest) + "\n"}
+        mesh.info = {
+            _REST: "\n".join(rest) + "\n",
+            UNKEPT: [("su2", "the other sections of the SU2 file")],
+        }
         named = ", ".join(dict.fromkeys(line.partition("=")[0].strip() for line in rest if "=" in line))
         notes.append(
             f"sections of the SU2 file that are not mesh are kept in SU2 files as they stand ({named})"
@@ -158,14 +157,39 @@ def _mesh(points, inside, outside, markers: list[str]) -> meshio.Mesh:
     return meshio.Mesh(points, cells, cell_data={"su2:tag": tags}, cell_sets=sets)
 
 
-def write_su2(path: Path, mesh: meshio.Mesh) -> None:
-    """Nodes, elements, and boundary cells by marker: by cell set, else by ``su2:tag``."""
-    dim = mesh.points.shape[1]
+def _reduce(mesh: meshio.Mesh, dim: int) -> list[str]:
+    named, material = sets_as_masks(mesh)[1], material_name(mesh, dim)
+    lost, name = keep_boundary_tags(mesh, dim, "su2:tag", dim - 1)
+    if name and name == material:
+        lost.append(f"{name} of the elements")
+    # markers are cell sets of the boundary
+    mesh.cell_sets = {n: [np.flatnonzero(m) for m in ms] for n, ms in named.items()}
+    top = [k for k, cells in enumerate(mesh.cells) if cells.dim == dim]
+    lost += [n for n, ms in mesh.cell_sets.items() if any(len(ms[k]) for k in top)]
+    return lost + list(mesh.point_sets)
+
+
+def _upright(mesh: meshio.Mesh) -> np.ndarray:
+    """x and y of a plane mesh; raises `ValueError` where they alone would not say where its elements are."""
+    nodes = np.unique(np.concatenate([cells.data.ravel() for cells in mesh.cells if cells.dim == 2]))
+    extent = np.ptp(mesh.points[nodes], axis=0)
+    if len(extent) == 3 and extent[2] > 1e-5 * extent[:2].max():
+        raise ValueError(
+            "its files hold x and y of plane meshes and nothing else, but this one lies in another plane"
+        )
+    return mesh.points[:, :2]
+
+
+def write_su2(path: Path, mesh: meshio.Mesh, dim: int, variant: str = "") -> list[str]:
+    """Nodes, elements, and boundary cells by marker: by cell set, else by ``su2:tag``.
+
+    Plane meshes are written without their third coordinate."""
+    points = _upright(mesh) if dim == 2 else mesh.points
     inside = [k for k, cells in enumerate(mesh.cells) if cells.dim == dim]
     outside = [k for k, cells in enumerate(mesh.cells) if cells.dim == dim - 1]
     with open(path, "w") as out:
-        out.write(f"NDIME= {dim}\nNPOIN= {len(mesh.points)}\n")
-        np.savetxt(out, mesh.points, fmt="%.16e")
+        out.write(f"NDIME= {dim}\nNPOIN= {len(points)}\n")
+        np.savetxt(out, points, fmt="%.16e")
         out.write(f"NELEM= {sum(len(mesh.cells[k]) for k in inside)}\n")
         for k in inside:
             _write_rows(out, mesh.cells[k], slice(None))
@@ -176,7 +200,8 @@ def write_su2(path: Path, mesh: meshio.Mesh) -> None:
             out.write(f"MARKER_TAG= {name}\nMARKER_ELEMS= {count}\n")
             for k in outside:
                 _write_rows(out, mesh.cells[k], rows[k])
-        out.write(recall(mesh, SU2_REST) or "")
+        out.write(recall(mesh, _REST) or "")
+    return []
 
 
 def _write_rows(out, cells: meshio.CellBlock, rows) -> None:
@@ -204,3 +229,32 @@ def _markers(mesh: meshio.Mesh, outside: list[int]) -> dict[str, dict[int, np.nd
     for tag in np.unique(np.concatenate(values)) if values else ():
         found[str(tag)] = {k: rest[k][tags[k][rest[k]] == tag] for k in outside}
     return found
+
+
+def patch_su2(
+    source: Source, old: Float[np.ndarray, "nodes dim"], new: Float[np.ndarray, "nodes dim"]
+) -> Patched:
+    """The file with other coordinates."""
+    content = source.content.replace(b"\r\n", b" \n").replace(b"\r", b"\n")  # of the same length
+    content = blanked(content, b"%")
+    head = re.search(rb"^[ \t]*NPOIN[ \t]*=[ \t]*(\d+)[^\n]*\n", content, re.M | re.I)
+    if head is None:
+        raise UnpatchableError("it has no section NPOIN")
+    following = re.compile(rb"^[^\n=]*=", re.M).search(content, head.end())
+    starts, ends = tokens(content, head.end(), following.start() if following else len(content))
+    count = int(head[1])
+    if not count or len(starts) % count:
+        raise UnpatchableError("the lines of its nodes don't have equally many numbers")
+    columns = slice(0, old.shape[1])
+    places = Places(starts.reshape(count, -1)[:, columns], ends.reshape(count, -1)[:, columns])
+    return Patched(put_text(source.content, places, old, new))
+
+
+SU2 = Format(
+    "su2",
+    (".su2",),
+    read_su2,
+    write_su2,
+    Holds(types=frozenset(_CODES), sets=True, reduce=_reduce),
+    patch=patch_su2,
+)

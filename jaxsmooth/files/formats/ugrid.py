@@ -8,8 +8,12 @@ import meshio
 import numpy as np
 
 from jaxsmooth.convert.checks import check_last_line
+from jaxsmooth.files.formats.meshios import read_as
+from jaxsmooth.files.formats.record import Format, Holds
+from jaxsmooth.files.formats.tables import patch_table
+from jaxsmooth.files.reduction import keep_boundary_tags
 
-__all__ = ["is_text", "read_ugrid", "write_ugrid"]
+__all__ = ["UGRID", "is_text", "read_ugrid", "write_ugrid"]
 
 _SURFACE = {"triangle": 3, "quad": 4}
 _VOLUME = {"tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8}
@@ -22,7 +26,12 @@ def is_text(path: Path) -> bool:
     return not _BINARY.intersection(part.lstrip(".").lower() for part in path.suffixes[-2:-1])
 
 
-def read_ugrid(path: Path) -> meshio.Mesh:
+def read_ugrid(path: Path) -> tuple[meshio.Mesh, list[str]]:
+    """A file as text or binary: the mesh, and notes."""
+    return (_read_text(path), []) if is_text(path) else read_as("ugrid")(path)
+
+
+def _read_text(path: Path) -> meshio.Mesh:
     """Nodes, boundary faces with their tags, and elements.  Raises `ValueError` in one sentence."""
     text = path.read_text()
     check_last_line(text.encode())
@@ -55,7 +64,7 @@ def read_ugrid(path: Path) -> meshio.Mesh:
     return meshio.Mesh(parts[0].reshape(-1, 3), cells, cell_data={"ugrid:ref": tags})
 
 
-def write_ugrid(path: Path, mesh: meshio.Mesh) -> None:
+def write_ugrid(path: Path, mesh: meshio.Mesh, dim: int, variant: str = "") -> list[str]:
     """Nodes, boundary faces with ``ugrid:ref`` (else 1), and elements."""
     tags = mesh.cell_data.get("ugrid:ref", [np.ones(len(cells), np.int64) for cells in mesh.cells])
     found = {name: [k for k, c in enumerate(mesh.cells) if c.type == name] for name in (*_SURFACE, *_VOLUME)}
@@ -76,3 +85,24 @@ def write_ugrid(path: Path, mesh: meshio.Mesh) -> None:
                 nodes = mesh.cells[k].data.astype(np.int64) + 1
                 nodes = nodes[:, np.argsort(_PYRAMID)] if name == "pyramid" else nodes
                 np.savetxt(out, nodes, fmt="%d")
+    return []
+
+
+def _refuse(path: Path) -> str | None:
+    if is_text(path):
+        return None
+    return "ugrid files are written as text, and this name says binary; name it .ugrid"
+
+
+UGRID = Format(
+    "ugrid",
+    (".ugrid",),
+    read_ugrid,
+    write_ugrid,
+    Holds(
+        types=frozenset({*_SURFACE, *_VOLUME}),
+        reduce=lambda mesh, dim: keep_boundary_tags(mesh, dim, "ugrid:ref", 2)[0],
+    ),
+    refuse=_refuse,
+    patch=patch_table(rb"\A\s*(\d+)(?:\s+\d+){6}\s", 0),
+)

@@ -10,17 +10,20 @@ import meshio
 import numpy as np
 
 from jaxsmooth.cells.table import TYPES, element_type
+from jaxsmooth.files.formats.record import Format, Holds
+from jaxsmooth.files.formats.xdmfgrids import only_grid, patch_xdmf
 
-__all__ = ["read_xdmf"]
+__all__ = ["XDMF", "read_xdmf", "write_xdmf"]
 
 
-def read_xdmf(path: Path) -> meshio.Mesh:
+def read_xdmf(path: Path) -> tuple[meshio.Mesh, list[str]]:
     """An XDMF file; mixed topologies are taken apart before meshio reads it."""
     from meshio.xdmf.common import meshio_to_xdmf_type, xdmf_idx_to_meshio_type
     from meshio.xdmf.main import XdmfReader
 
     root = ElementTree.parse(path).getroot()
     reader = XdmfReader(str(path))
+    notes = only_grid(root)
     for grid in root.iter("Grid"):
         for topology in grid.findall("Topology"):
             kind = topology.get("Type", topology.get("TopologyType"))
@@ -40,7 +43,7 @@ def read_xdmf(path: Path) -> meshio.Mesh:
                 at += 1
     version = root.attrib.get("Version", "3")
     read = reader.read_xdmf2 if version.startswith("2") else reader.read_xdmf3
-    return read(root)
+    return read(root), notes
 
 
 def _split_mixed(numbers: np.ndarray, types: dict[int, str]) -> Iterator[tuple[str, np.ndarray]]:
@@ -57,3 +60,28 @@ def _split_mixed(numbers: np.ndarray, types: dict[int, str]) -> Iterator[tuple[s
         end = at + width * int(other[0]) if len(other) else len(numbers)
         yield name, numbers[at:end].reshape(-1, width)[:, skip:]
         at = end
+
+
+def write_xdmf(path: Path, mesh: meshio.Mesh, dim: int, variant: str = "") -> list[str]:
+    """Write one file: a companion .h5 could not be told from one that is there."""
+    mesh.point_data = {name: _wide(values) for name, values in mesh.point_data.items()}
+    mesh.cell_data = {name: [_wide(part) for part in parts] for name, parts in mesh.cell_data.items()}
+    meshio.write(path, mesh, file_format="xdmf", data_format="XML")
+    return []
+
+
+def _wide(values: np.ndarray) -> np.ndarray:
+    """meshio's XDMF has no integers of fewer than four bytes."""
+    small = values.dtype.kind in "iu" and values.dtype.itemsize < 4
+    return values.astype(np.int32) if small else values
+
+
+XDMF = Format(
+    "xdmf",
+    (".xdmf", ".xmf"),
+    read_xdmf,
+    write_xdmf,
+    Holds(lacks=frozenset({"pyramid14"}), any_data=True, space=True),
+    needs="h5py",
+    patch=patch_xdmf,
+)
