@@ -41,11 +41,15 @@ class Row:
 
 
 def moved(file: js.MeshFile) -> np.ndarray:
-    """Coordinates with every third node of the elements, unless held, moved by a thousandth of the size."""
+    """Coordinates with every third node moved by a thousandth of the size, unless it is held or linked."""
     points = np.array(file.mesh.points)
     used = np.unique(np.concatenate([np.asarray(nodes).ravel() for nodes in file.mesh.connectivity]))
-    held = file.mesh.labels.held  # periodic nodes, say
-    rows = used[::3] if held is None else used[::3][~np.asarray(held)[used[::3]]]
+    labels, stays = file.mesh.labels, np.zeros(len(points), bool)
+    if labels.held is not None:
+        stays |= np.asarray(labels.held)
+    if labels.links is not None:  # periodic nodes, say: Gmsh puts them where their partners are
+        stays[labels.links.nodes] = stays[labels.links.parents] = True
+    rows = used[::3][~stays[used[::3]]]
     random = np.random.default_rng(0)
     points[rows] += 1e-3 * np.ptp(points[used], axis=0).max() * random.uniform(-1, 1, points[rows].shape)
     return points

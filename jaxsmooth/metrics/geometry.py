@@ -92,7 +92,7 @@ def _neighbours(kind: ElementType) -> np.ndarray:
     count = kind.corners - (kind.dim == 3 and kind.corners == 5)
     rows = []
     for corner in range(count):
-        ends = [a + b - corner for a, b in kind.shape.edges if corner in (a, b)]
+        ends = [a + b - corner for a, b in kind.edges if corner in (a, b)]
         if np.linalg.det(kind.natural[ends] - kind.natural[corner]) < 0:
             ends = [ends[1], ends[0], *ends[2:]]
         rows.append(ends)
