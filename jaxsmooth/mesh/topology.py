@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
+import jax
 import numpy as np
 
 from jaxsmooth.cells.table import ElementType
 from jaxsmooth.mesh.hanging import covered
+from jaxsmooth.mesh.memory import Remembered
 from jaxsmooth.mesh.record import Mesh
 
 __all__ = ["Facets", "facet_keys", "find_facets", "lengths", "node_pairs", "pair_codes", "signed_measures"]
@@ -34,12 +37,20 @@ class Facets:
         return Facets(self.type, self.nodes[chosen], self.region[chosen], self.partner[chosen])
 
 
+_FACETS: Remembered[list[Facets]] = Remembered()
+
+
 def find_facets(mesh: Mesh) -> list[Facets]:
-    """All facets of a mesh, with the region on either side.
+    """All facets of a mesh, with the region on either side; found once for meshes of one topology.
 
     Two elements share a facet when they share its corner nodes, or when nodes that hang on it
     (`Labels.links`) divide it on one side.  Boundary facets have ``partner == -1``.
     """
+    arrays = jax.tree.leaves((mesh.connectivity, mesh.labels))
+    return _FACETS.get(arrays, partial(_find_facets, mesh))
+
+
+def _find_facets(mesh: Mesh) -> list[Facets]:
     owners: dict[ElementType, list[tuple[np.ndarray, np.ndarray]]] = {}
     for (kind, nodes), region in zip(mesh.blocks, _regions(mesh), strict=True):
         nodes = np.asarray(nodes)

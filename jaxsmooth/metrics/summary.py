@@ -8,16 +8,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxsmooth.assembly import gather
 from jaxsmooth.convert.meshfile import as_mesh
+from jaxsmooth.mesh.memory import Remembered
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.metrics.evaluation import Evaluation, evaluate
 from jaxsmooth.metrics.shape import scaled_jacobian
 from jaxsmooth.metrics.validity import inverted
 
-__all__ = ["POOR", "Statistics", "evaluated", "statistics"]
+__all__ = ["POOR", "Statistics", "corners", "evaluated", "remember", "statistics"]
 
 POOR = 0.2
 """Quality below which an element counts as poor (Tables 7 and 8)."""
@@ -36,19 +37,34 @@ class Statistics:
     scaled_jacobian_min: float
 
 
-evaluated = jax.jit(evaluate)
-"""`evaluate`, compiled."""
+_evaluate = jax.jit(evaluate)
+_EVALUATIONS: Remembered[Evaluation] = Remembered()
+
+
+def evaluated(mesh: Mesh) -> Evaluation:
+    """`evaluate`, compiled; a mesh that was just evaluated is not evaluated again."""
+    return _EVALUATIONS.get((mesh.points, *mesh.connectivity), lambda: _evaluate(mesh.bare))
+
+
+def remember(mesh: Mesh, evaluation: Evaluation) -> None:
+    """Keep an evaluation that is known for `evaluated`."""
+    _EVALUATIONS.put((mesh.points, *mesh.connectivity), evaluation)
+
+
+@jax.jit
+def corners(mesh: Mesh, evaluation: Evaluation) -> list[Float[Array, " _"]]:
+    """The scaled Jacobian of all elements, block by block."""
+    return [
+        jax.vmap(partial(scaled_jacobian, kind))(gather(mesh.points, nodes)) if known is None else known
+        for (kind, nodes), known in zip(mesh.blocks, evaluation.corners, strict=True)
+    ]
 
 
 @partial(jax.jit, static_argnames=("threshold",))
 def _summary(mesh: Mesh, evaluation: Evaluation, threshold: float) -> tuple[Array, ...]:
     q = jnp.concatenate(evaluation.quality)
     deviation = jnp.std(q, ddof=1) if q.size > 1 else jnp.zeros((), q.dtype)
-    corners = [
-        jax.vmap(partial(scaled_jacobian, kind))(gather(mesh.points, nodes)) if known is None else known
-        for (kind, nodes), known in zip(mesh.blocks, evaluation.corners, strict=True)
-    ]
-    worst = jnp.stack([part.min() for part in corners]).min()
+    worst = jnp.stack([part.min() for part in corners(mesh, evaluation)]).min()
     return q.min(), q.max(), q.mean(), deviation, worst, (q < threshold).sum()
 
 

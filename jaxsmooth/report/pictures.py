@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.mesh.topology import find_facets
-from jaxsmooth.metrics.table import quality
+from jaxsmooth.metrics.summary import evaluated
 
 try:
     from matplotlib.axes import Axes
@@ -40,7 +40,7 @@ def before_after(before: Mesh, after: Mesh, title: str = "", view: tuple[float, 
     figure = Figure(figsize=(15, 5.2), layout="constrained")
     axes = figure.subplots(1, 3, width_ratios=(1, 1, 0.85))
     for axis, mesh, label in zip(axes, (before, after), ("before", "after"), strict=False):
-        q = np.concatenate([np.asarray(part) for part in quality(mesh)])
+        q = np.concatenate(_quality(mesh))
         if mesh.dim == 3:
             draw_poor_elements(axis, mesh, limit=POOR, view=view)
         else:
@@ -55,9 +55,13 @@ def before_after(before: Mesh, after: Mesh, title: str = "", view: tuple[float, 
     return figure
 
 
+def _quality(mesh: Mesh) -> list[np.ndarray]:
+    return [np.asarray(part) for part in evaluated(mesh).quality]
+
+
 def histogram(axis: Axes, before: Mesh, after: Mesh) -> None:
     """Elements by quality before and after, on a logarithmic scale that shows the few worst."""
-    values = [np.concatenate([np.asarray(part) for part in quality(mesh)]) for mesh in (before, after)]
+    values = [np.concatenate(_quality(mesh)) for mesh in (before, after)]
     values = [np.clip(v, 1e-9, 1) for v in values]
     axis.hist(values[1], _BINS, color=_AFTER, alpha=0.75, label="after")
     axis.hist(values[0], _BINS, color=_BEFORE, histtype="step", linewidth=1.8, label="before")
@@ -74,7 +78,7 @@ def draw_mesh(
     colours = Normalize(0, 1)
     if mesh.dim == 2:
         shapes, values = [], []
-        for (kind, nodes), q in zip(mesh.blocks, quality(mesh), strict=True):
+        for (kind, nodes), q in zip(mesh.blocks, _quality(mesh), strict=True):
             shapes += list(np.asarray(mesh.points)[np.asarray(nodes)[:, kind.outline]])
             values.append(np.asarray(q))
         faces = _QUALITY(colours(np.concatenate(values)))
@@ -132,7 +136,7 @@ def _element_facets(
             chosen = facets.nodes[facets.partner < 0][:, : facets.type.corners]
             groups.append((chosen, np.ones(len(chosen))))
     else:
-        for (kind, nodes), q in zip(mesh.blocks, quality(mesh), strict=True):
+        for (kind, nodes), q in zip(mesh.blocks, _quality(mesh), strict=True):
             q = np.asarray(q)
             chosen = np.asarray(nodes)[q < limit]
             for group in kind.facets:

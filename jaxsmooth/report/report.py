@@ -20,9 +20,8 @@ from rich.table import Table
 
 from jaxsmooth.convert.meshfile import MeshFile
 from jaxsmooth.files.outputs import Outputs
-from jaxsmooth.guards.acceptance import POOR
 from jaxsmooth.mesh.record import Mesh
-from jaxsmooth.metrics.table import quality
+from jaxsmooth.metrics.summary import POOR, corners, evaluated
 from jaxsmooth.metrics.validity import inverted
 from jaxsmooth.motion.base import Motion
 from jaxsmooth.runs.driver import SmoothResult, StepRecord
@@ -91,28 +90,25 @@ def movable_elements(mesh: Mesh, constraints: Motion) -> tuple[np.ndarray, ...]:
     return tuple(free[np.asarray(nodes)].any(axis=1) for nodes in mesh.connectivity)
 
 
-def _values(mesh: Mesh, name: str, masks: tuple[np.ndarray, ...] | None = None) -> np.ndarray:
-    parts = [np.asarray(part, np.float64) for part in quality(mesh, name)]
-    if masks is not None:
-        parts = [part[mask] for part, mask in zip(parts, masks, strict=True)]
-    return np.concatenate(parts)
-
-
 def summarise(mesh: Mesh, masks: tuple[np.ndarray, ...] | None = None) -> dict[str, float]:
     """The statistics of the final table, over all or over chosen elements."""
-    q, tangled = _values(mesh, "shape", masks), inverted(mesh)
-    if masks is not None:
-        tangled = tuple(part[mask] for part, mask in zip(tangled, masks, strict=True))
-    scaled = _values(mesh, "scaled_jacobian", masks)
+    evaluation = evaluated(mesh)
+    sides = evaluation.quality, corners(mesh.bare, evaluation), inverted(mesh, evaluation.jacobian)
+    chosen = masks or (slice(None),) * len(mesh.blocks)
+    q, scaled, tangled = (
+        np.concatenate([np.asarray(part)[mask] for part, mask in zip(side, chosen, strict=True)])
+        for side in sides
+    )
     if len(q) == 0:
         return {}
+    q = q.astype(np.float64)
     return {
         "q_min": q.min(),
         "q_avg": q.mean(),
         "q_max": q.max(),
         "q_std": q.std(ddof=1) if len(q) > 1 else 0.0,
         "q_below_0.2": int((q < POOR).sum()),
-        "inverted": sum(int(part.sum()) for part in tangled),
+        "inverted": int(tangled.sum()),
         "scaled_jacobian_min": scaled.min(),
     }
 

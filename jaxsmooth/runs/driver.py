@@ -16,7 +16,7 @@ from jaxsmooth.guards.acceptance import AcceptanceRule, Status
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.methods import Elastic, Method
 from jaxsmooth.metrics.evaluation import Evaluation
-from jaxsmooth.metrics.summary import Statistics, evaluated, statistics
+from jaxsmooth.metrics.summary import Statistics, evaluated, remember, statistics
 from jaxsmooth.motion.base import Motion
 from jaxsmooth.motion.detect import detect_constraints
 
@@ -130,6 +130,7 @@ def smooth(
     driver = _Driver(method, constraints, state, accept, tolerances, callback, place)
     status = driver.run(steps)
     end, history = driver.reached, tuple(driver.history)
+    remember(end.mesh, end.evaluation)
     return SmoothResult(end.mesh.with_labels(labels), end.evaluation, history, status, constraints)
 
 
