@@ -131,7 +131,7 @@ class Problem(eqx.Module):
             jnp.concatenate([part.reshape(-1) for part in side]) for side in zip(*found, strict=True)
         )
 
-    def determinants(self, points: Field) -> tuple[Float[Array, "chunks size"], ...]:
+    def determinants(self, points: Field) -> tuple[Float[Array, "_ _"], ...]:
         """The least determinant of every element over its target's; ∞ for those without weight."""
 
         def found(kind, block):
@@ -151,7 +151,7 @@ class Problem(eqx.Module):
             ]
         ).min()
 
-    def hopeless(self, points: Field) -> tuple[Bool[Array, "chunks size"], ...]:
+    def hopeless(self, points: Field) -> tuple[Bool[Array, "_ _"], ...]:
         """The elements that stay inverted: a determinant is not positive and all its nodes are held."""
         free = movable(self.motion.at(points))
 
@@ -165,12 +165,12 @@ class Problem(eqx.Module):
 
         return tuple(found(kind, block) for kind, block in zip(self.kinds, self.blocks, strict=True))
 
-    def inverted(self, points: Field, but: tuple[Bool[Array, "chunks size"], ...]) -> Scalar:
+    def inverted(self, points: Field, but: tuple[Bool[Array, "_ _"], ...]) -> Scalar:
         """The number of inverted elements, but for some."""
         dets = self.determinants(points)
         return sum(((det <= 0) & ~out).sum(dtype=det.dtype) for det, out in zip(dets, but, strict=True))
 
-    def giving_up(self, points: Field, elements: tuple[Bool[Array, "chunks size"], ...]) -> Problem:
+    def giving_up(self, points: Field, elements: tuple[Bool[Array, "_ _"], ...]) -> Problem:
         """The problem in which those of the elements that are inverted do not stop the others."""
         dets = self.determinants(points)
         relief = [
