@@ -234,7 +234,7 @@ def test_the_goal_reaches_the_method(part, tmp_path, monkeypatch):
 
 
 def test_freezing_reaches_the_constraints(part, tmp_path, monkeypatch):
-    detect = "jaxsmooth.motion.planar.detect_constraints"
+    detect = "jaxsmooth.motion.detect.detect_constraints"
     smooth = ("smooth", part, tmp_path / "out.vtu")
     assert "freeze_aspect" not in arguments_of(monkeypatch, detect, *smooth)[1]
     for command in (smooth, ("compare", part)):

@@ -98,9 +98,9 @@ class Mesh(eqx.Module):
         """Element type and connectivity of every block."""
         return [(element_type(n), c) for n, c in zip(self.types, self.connectivity, strict=True)]
 
-    def with_points(self, points: Float[Array, "nodes dim"]) -> Mesh:
-        """The same topology with other coordinates; `points` may be traced by JAX."""
-        return eqx.tree_at(lambda mesh: mesh.points, self, points)
+    def with_points(self, points: Float[Array | np.ndarray, "..."]) -> Mesh:
+        """The same topology with other coordinates; `points` may be traced by JAX, or a batch."""
+        return eqx.tree_at(lambda mesh: mesh.points, self, jnp.asarray(points))
 
     @property
     def bare(self) -> Mesh:
