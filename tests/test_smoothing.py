@@ -23,7 +23,7 @@ class Mover(Method):
     guard: js.PatchGuard | None
     move: jax.Array
 
-    def propose(self, mesh, constraints, before):
+    def propose(self, mesh, motion, before, state=None):
         return Proposal(self.move, jnp.int32(0), jnp.zeros(()))
 
 
