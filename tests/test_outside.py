@@ -91,7 +91,7 @@ def test_free_size_is_that_of_the_nearest_ideal_element():
 def test_a_goal_and_a_rule():
     goal = js.Goal((js.Stage(1, 0.5, 2), js.Stage(1, 0.5, 6)))
     strict = js.AcceptanceRule(average=-0.5)  # asks for more than can be had
-    mesh = square(0.1)
+    mesh = square(0.04)
     refused = js.smooth(mesh, js.Optimize(goal=goal), accept=strict, steps=1)
     np.testing.assert_array_equal(refused.mesh.points, mesh.points)
     assert refused.status is js.Status.LOWER_AVERAGE
