@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxsmooth.cells.table import ElementType
 from jaxsmooth.mesh.hanging import covered
+from jaxsmooth.mesh.links import NodeLinks
 from jaxsmooth.mesh.record import Mesh
 
 __all__ = ["Facets", "facet_keys", "find_facets", "lengths", "node_pairs", "pair_codes", "signed_measures"]
@@ -57,7 +58,7 @@ def find_facets(mesh: Mesh) -> list[Facets]:
     regions = np.concatenate([region for _, _, region in found])
     partner = _pair(keys, regions)
     if mesh.labels is not None and mesh.labels.links is not None:
-        _pair_hanging(mesh, found, regions, partner)
+        _pair_hanging(mesh, mesh.labels.links, found, regions, partner)
     ends = np.cumsum([len(nodes) for _, nodes, _ in found])
     return [
         Facets(kind, nodes, region, other)
@@ -89,14 +90,16 @@ def _pair(keys: np.ndarray, regions: np.ndarray) -> np.ndarray:
     return partner
 
 
-def _pair_hanging(mesh: Mesh, facets: list, regions: np.ndarray, partner: np.ndarray) -> None:
+def _pair_hanging(
+    mesh: Mesh, links: NodeLinks, facets: list, regions: np.ndarray, partner: np.ndarray
+) -> None:
     """Fill in the regions on the other side of facets that are divided there, and of their parts."""
     outer = np.flatnonzero(partner < 0)
     ends = np.searchsorted(outer, np.cumsum([len(nodes) for _, nodes, _ in facets])[:-1])
     rows = np.split(outer, ends)
     start = np.cumsum([0, *(len(nodes) for _, nodes, _ in facets)])
     chosen = [(kind, nodes[r - s]) for (kind, nodes, _), r, s in zip(facets, rows, start, strict=False)]
-    pairs = outer[covered(np.asarray(mesh.points, np.float64), chosen, mesh.labels.links)]
+    pairs = outer[covered(np.asarray(mesh.points, np.float64), chosen, links)]
     partner[pairs[:, 0]] = regions[pairs[:, 1]]
     partner[pairs[:, 1]] = regions[pairs[:, 0]]
 
