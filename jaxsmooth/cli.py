@@ -8,7 +8,6 @@ import json
 import math
 import os
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -159,7 +158,7 @@ def _quality(options: argparse.Namespace, outputs: Outputs) -> int:
     quality.print_report(out, file, values, rows)
     if options.csv is not None:
         outputs.text(options.csv, quality.csv_text(file, values))
-    if data:
+    if options.quality_data is not None:
         notes = write_to(outputs, options.quality_data, file, cell_data=quality.cell_data(file.mesh, values))
         _print_losses(out, notes, options.quality_data)
     if options.json is not None:
@@ -302,7 +301,7 @@ def _constraints(file: MeshFile, options: argparse.Namespace) -> Motion:
     )
 
 
-def _print_losses(out: Console, notes: Sequence[str], output: str) -> None:
+def _print_losses(out: Console, notes: tuple[str, ...], output: str) -> None:
     """What the output can't hold is said even to those who asked for silence."""
     from jaxsmooth.report import report
 

@@ -341,7 +341,7 @@ def add_element_type(row: ElementType) -> ElementType:
             "1; give points and weights of the natural domain"
         )
     if row.dim > 1:  # what the edges and facets are is found now, or refused
-        row.edge_nodes, row.facets  # noqa: B018
+        _ = row.edge_nodes, row.facets
     TYPES[row.name] = row
     return row
 

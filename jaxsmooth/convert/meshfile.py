@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import jax
 import meshio
 import numpy as np
+from jax.core import Tracer
 
 from jaxsmooth.convert.blocks import collected, count_orphans, oriented, placed, without_cohesive
 from jaxsmooth.convert.checks import (
@@ -214,7 +214,7 @@ def as_mesh(anything: Any) -> Mesh:
 
 def _from_pair(points: Any, blocks: Any) -> meshio.Mesh:
     """What a pair ``(points, {"tetra": nodes})`` says, as a file would say it."""
-    if isinstance(points, jax.core.Tracer):
+    if isinstance(points, Tracer):
         raise ValueError(
             "the numbering of elements can't be checked while JAX traces the points; build the mesh before, "
             "by as_mesh((points, blocks)), and trace mesh.with_points(points)"

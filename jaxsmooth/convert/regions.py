@@ -130,8 +130,9 @@ def region_arrays(source: meshio.Mesh, blocks: Sequence[int]) -> Iterator[tuple[
         name = found.get(folded(wanted))
         if name is not None:
             tags = {k: integers(source.cell_data[name][k]) for k in blocks}
-            if all(t is not None for t in tags.values()):
-                yield name, tags
+            whole = {k: t for k, t in tags.items() if t is not None}
+            if len(whole) == len(tags):
+                yield name, whole
 
 
 def members_of(members: Any, block: int) -> np.ndarray | None:

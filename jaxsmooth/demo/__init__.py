@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from jaxsmooth.files.outputs import Outputs
 
 __all__ = ["MESH", "run"]
@@ -27,11 +30,8 @@ def run(directory: Path, outputs: Outputs) -> None:
 
     out = report.console()
     names = ["bracket-smooth.vtu"]
-    try:
-        from jaxsmooth.report.pictures import before_after
-    except ImportError as missing:
-        out.print(f"neither picture nor report: {missing}", style="yellow")
-    else:
+    draw = _before_after(out)
+    if draw is not None:
         names += ["before-after.png", "report.html"]
     outputs.folder(directory)
     mesh_path, *picture_paths = paths = [directory / name for name in names]
@@ -43,11 +43,21 @@ def run(directory: Path, outputs: Outputs) -> None:
     report.print_constraints(out, result.constraints, result.mesh)
     write_to(outputs, mesh_path, file, result, cell_data={"quality": result.quality})
     before = as_mesh(file)
-    if picture_paths:
-        figure = before_after(before, result.mesh, f"{_TITLE}: a bracket, elastic-extended")
+    if draw is not None:
+        figure = draw(before, result.mesh, f"{_TITLE}: a bracket, elastic-extended")
         with outputs.file(picture_paths[0]) as part:
             figure.savefig(part, dpi=130)
         outputs.text(picture_paths[1], report.html_page(_TITLE, before, result))
     report.print_comparison(out, before, result)
     outputs.commit()
     out.print(f"{result.status}; wrote {', '.join(names)} to {directory}/")
+
+
+def _before_after(out: Console) -> Callable[..., Any] | None:
+    """What draws the picture; without matplotlib nothing does."""
+    try:
+        from jaxsmooth.report.pictures import before_after
+    except ImportError as missing:
+        out.print(f"neither picture nor report: {missing}", style="yellow")
+        return None
+    return before_after

@@ -146,7 +146,9 @@ def write_to(
     except MeshFileError as error:
         if isinstance(error.__cause__, OSError):  # not for the format to help: a full disk, say
             raise _unwritable(path, error.__cause__) from error
-        raise MeshFileError(str(error).replace(str(part), str(path))) from error
+        # only the writer raises it, which has a part
+        message = str(error).replace(str(part), str(path))  # pyright: ignore[reportPossiblyUnboundVariable]
+        raise MeshFileError(message) from error
     except OSError as error:
         raise _unwritable(path, error) from error
     return tuple(notes)

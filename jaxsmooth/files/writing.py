@@ -15,7 +15,7 @@ from jaxsmooth.convert.checks import MeshFileError
 from jaxsmooth.convert.regions import NOT_SETS, SECTIONS, plain, recall
 from jaxsmooth.files.formats.meshios import quiet
 from jaxsmooth.files.formats.record import Format, stem_format
-from jaxsmooth.files.formats.table import format_named
+from jaxsmooth.files.formats.table import FORMATS, format_named
 from jaxsmooth.files.reduction import BLOCKWISE, UNKEPT, add_materials, sets_to_data
 
 __all__ = ["check_types", "check_writable", "write_source"]
@@ -51,7 +51,7 @@ def check_types(names: Iterable[str], path: Path, format: str) -> None:
 def _instead(names: Iterable[str]) -> str:
     """The formats to recommend for elements of these types."""
     suffixes = {"vtu": ".vtu", "gmsh22": ".msh", "xdmf": ".xdmf"}
-    able = [end for stem, end in suffixes.items() if all(map(format_named(stem).holds.cells, names))]
+    able = [end for stem, end in suffixes.items() if all(map(FORMATS[stem].holds.cells, names))]
     return " or ".join(filter(None, (", ".join(able[:-1]), *able[-1:]))) or ".npz"
 
 
@@ -81,7 +81,8 @@ def write_source(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> list[s
     variant = format.partition(":")[2] or record.variants[0]
     try:
         with quiet() as said:
-            notes += record.write(path, mesh, dim, variant)
+            # check_writable refuses formats without a writer
+            notes += record.write(path, mesh, dim, variant)  # pyright: ignore[reportOptionalCall]
     except ModuleNotFoundError as error:
         raise MeshFileError(
             f"{path}: writing {record.name} files needs {error.name}; "
@@ -119,12 +120,12 @@ def _clean(mesh: meshio.Mesh, record: Format, notes: list[str]) -> meshio.Mesh:
     # a mixture of types may differ in dtype from block to block
     out.cell_data = {}
     for name, parts in mesh.cell_data.items():
-        parts = [_array(parts[k]) for k in kept]
-        if any(part is None for part in parts) or len({part.shape[1:] for part in parts}) > 1:
+        arrays = [array for k in kept if (array := _array(parts[k])) is not None]
+        if len(arrays) < len(kept) or len({array.shape[1:] for array in arrays}) > 1:
             notes.append(f"the cell data {name!r} are not numbers in every cell; they are not written")
         else:
-            common = np.result_type(*parts)
-            out.cell_data[name] = [part.astype(common) for part in parts]
+            common = np.result_type(*arrays)
+            out.cell_data[name] = [array.astype(common) for array in arrays]
     out.point_data = {}
     for name, values in mesh.point_data.items():
         if (array := _array(values)) is None:

@@ -43,9 +43,10 @@ def covered(
     number, area = np.concatenate(numbers), np.concatenate(areas)
     has = _incidence(np.concatenate(rows), np.concatenate(columns), (len(number), len(points)))
     link, slot = np.nonzero(links.weights)
-    parents = _incidence(link, links.parents[link, slot], (len(links.nodes), len(points)))
-    hangs = _incidence(np.arange(len(links.nodes)), links.nodes, parents.shape)
-    reach = (has + _contains(has, parents) @ hangs).astype(bool).astype(np.int32)
+    shape = len(links.nodes), len(points)
+    parents = _incidence(link, links.parents[link, slot], shape)
+    hangs = _incidence(np.arange(len(links.nodes)), links.nodes, shape)
+    reach = csr_matrix((has + _contains(has, parents) @ hangs).astype(bool).astype(np.int32))
     pairs = _contains(reach, has).tocoo()
     whole, part = pairs.row[pairs.row != pairs.col], pairs.col[pairs.row != pairs.col]
     rest = area.copy()
@@ -61,7 +62,7 @@ def _incidence(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int]) ->
 def _contains(sets: csr_matrix, others: csr_matrix) -> csr_matrix:
     """1 where a set (row) has all nodes of another one (column)."""
     common = (sets @ others.T).tocoo()
-    all_ = common.data == others.sum(axis=1).A1[common.col]
+    all_ = common.data == np.asarray(others.sum(axis=1)).ravel()[common.col]
     return csr_matrix((all_[all_].astype(np.int32), (common.row[all_], common.col[all_])), common.shape)
 
 

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsmooth.cells.table import ElementType, element_type
@@ -131,7 +132,7 @@ class Mesh(eqx.Module):
 
 
 def _as_points(points: Any) -> Float[Array, "nodes dim"]:
-    if isinstance(points, jax.core.Tracer):
+    if isinstance(points, Tracer):
         return points
     array = np.asarray(points)
     if array.ndim != 2 or array.shape[1] not in (2, 3):

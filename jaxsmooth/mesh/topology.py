@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxsmooth.cells.table import ElementType
 from jaxsmooth.mesh.hanging import covered
+from jaxsmooth.mesh.links import NodeLinks
 from jaxsmooth.mesh.memory import Remembered
 from jaxsmooth.mesh.record import Mesh
 
@@ -68,7 +69,7 @@ def _find_facets(mesh: Mesh) -> list[Facets]:
     regions = np.concatenate([region for _, _, region in found])
     partner = _pair(keys, regions)
     if mesh.labels is not None and mesh.labels.links is not None:
-        _pair_hanging(mesh, found, regions, partner)
+        _pair_hanging(mesh, mesh.labels.links, found, regions, partner)
     ends = np.cumsum([len(nodes) for _, nodes, _ in found])
     return [
         Facets(kind, nodes, region, other)
@@ -100,14 +101,16 @@ def _pair(keys: np.ndarray, regions: np.ndarray) -> np.ndarray:
     return partner
 
 
-def _pair_hanging(mesh: Mesh, facets: list, regions: np.ndarray, partner: np.ndarray) -> None:
+def _pair_hanging(
+    mesh: Mesh, links: NodeLinks, facets: list, regions: np.ndarray, partner: np.ndarray
+) -> None:
     """Fill in the regions on the other side of facets that are divided there, and of their parts."""
     outer = np.flatnonzero(partner < 0)
     ends = np.searchsorted(outer, np.cumsum([len(nodes) for _, nodes, _ in facets])[:-1])
     rows = np.split(outer, ends)
     start = np.cumsum([0, *(len(nodes) for _, nodes, _ in facets)])
     chosen = [(kind, nodes[r - s]) for (kind, nodes, _), r, s in zip(facets, rows, start, strict=False)]
-    pairs = outer[covered(np.asarray(mesh.points, np.float64), chosen, mesh.labels.links)]
+    pairs = outer[covered(np.asarray(mesh.points, np.float64), chosen, links)]
     partner[pairs[:, 0]] = regions[pairs[:, 1]]
     partner[pairs[:, 1]] = regions[pairs[:, 0]]
 

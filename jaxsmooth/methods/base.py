@@ -74,17 +74,17 @@ class Method(eqx.Module):
         """
         if not isinstance(self.guard, PatchGuard):
             return (self,)
-        looser = self._looser() if tangled else ()
-        return (*looser, self, self._guarded(keep=1.0))
+        looser = self._looser(self.guard) if tangled else ()
+        return (*looser, self, self._guarded(self.guard, keep=1.0))
 
-    def _looser(self) -> tuple[Method, Method]:
+    def _looser(self, guard: PatchGuard) -> tuple[Method, Method]:
         return (
-            self._guarded(gamma=0.0, poor=_NEXT_TO_NOTHING, corner=_NEXT_TO_NOTHING),
-            self._guarded(gamma=0.0, poor=0.0, corner=0.0),
+            self._guarded(guard, gamma=0.0, poor=_NEXT_TO_NOTHING, corner=_NEXT_TO_NOTHING),
+            self._guarded(guard, gamma=0.0, poor=0.0, corner=0.0),
         )
 
-    def _guarded(self, **numbers: float) -> Method:
-        return eqx.tree_at(lambda method: method.guard, self, replace(self.guard, **numbers))
+    def _guarded(self, guard: PatchGuard, **numbers: float) -> Method:
+        return eqx.tree_at(lambda method: method.guard, self, replace(guard, **numbers))
 
     @abc.abstractmethod
     def propose(self, mesh: Mesh, motion: Motion, before: Evaluation, state: Any = None) -> Proposal:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +26,8 @@ _MANY = 64  # samples; more are taken in layers
 _DEPTH = 12  # halvings; what is undecided then has a least determinant of some 4⁻¹² of its variation
 _PIECES = 4096  # of one element; more are needed only where the determinant is zero along a curve
 _CHUNK = 1 << 18  # coefficients that are halved at a time
+
+_Either = TypeVar("_Either", Array, np.ndarray)
 
 
 def determinant_bound(kind: ElementType, nodes: Float[Array, "k dim"]) -> Float[Array, ""]:
@@ -96,7 +99,7 @@ def _noise(matrix: np.ndarray, numbers: np.finfo) -> float:
     return _ROUNDING * float(numbers.eps) * float(np.linalg.norm(matrix, axis=1).max())
 
 
-def _volumes(tangents: Sequence[Array | np.ndarray]) -> Array | np.ndarray:
+def _volumes(tangents: Sequence[_Either]) -> _Either:
     """Determinants of the matrices with these columns ``[..., dim]``, which broadcast."""
     (a, b), (c, d) = ((t[..., 0], t[..., 1]) for t in tangents[:2])
     if len(tangents) == 2:

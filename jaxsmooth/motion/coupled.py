@@ -49,7 +49,7 @@ class Coupled(Motion):
     @property
     def freedom(self) -> np.ndarray:
         """Free directions of every node ``[nodes]``, where `base` has them as `Constraints` do."""
-        free = self.base.freedom.copy()
+        free = self.base.freedom.copy()  # pyright: ignore[reportAttributeAccessIssue]  # see above
         free[np.asarray(self.links.dependent)] = free[np.asarray(self.links.parents)].max(axis=1)
         return free
 

@@ -107,7 +107,7 @@ class Admissible(eqx.Module):
     def collect(self, forces: Field) -> Field:
         """``Tᵀ f``: forces on dependent nodes act on their parents."""
         if self.links is not None:
-            forces = self._added(forces, self.links.weights)
+            forces = _added(self.links, forces, self.links.weights)
         return self.restrict(forces)
 
     def independent(self, field: Field) -> Field:
@@ -117,7 +117,7 @@ class Admissible(eqx.Module):
         links = self.links
         rigid = links.rigid[:, None] * links.weights
         count = jnp.ones(len(field), field.dtype).at[links.parents].add(rigid)
-        return self.restrict(self._added(field, rigid) / count[:, None])
+        return self.restrict(_added(links, field, rigid) / count[:, None])
 
     def project(self, field: Field) -> Field:
         """An admissible displacement near any displacement: the nearest, but where nodes hang on others."""
@@ -160,7 +160,7 @@ class Admissible(eqx.Module):
             return mask
         return mask.at[self.links.dependent].set(mask[self.links.parents].any(axis=1))
 
-    def _added(self, field: Field, weights: Float[Array, "links p"]) -> Field:
-        links = self.links
-        back = (field[links.dependent][:, :, None] * links.rotations).sum(axis=1)
-        return field.at[links.parents].add(weights[..., None] * back[:, None])
+
+def _added(links: Links, field: Field, weights: Float[Array, "links p"]) -> Field:
+    back = (field[links.dependent][:, :, None] * links.rotations).sum(axis=1)
+    return field.at[links.parents].add(weights[..., None] * back[:, None])

@@ -52,7 +52,7 @@ def _rotation_jvp(primals: tuple[Matrix], tangents: tuple[Matrix]) -> tuple[Matr
     size = jax.lax.stop_gradient(jnp.where(size > 0, size, 1))
     moments, change = moments / size, change / size
     s, d = r @ moments, r @ change
-    floor = 8 * jnp.finfo(moments.dtype).eps
+    floor = 8 * float(jnp.finfo(moments.dtype).eps)
     skew = d - d.T
     if len(moments) == 2:
         stiffness = jnp.trace(s)

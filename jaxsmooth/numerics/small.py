@@ -44,7 +44,8 @@ def determinant(a: Float[Array, "... dim dim"]) -> Float[Array, ...]:
     """Determinant by expansion along the first row."""
     if a.shape[-1] == 2:
         return a[..., 0, 0] * a[..., 1, 1] - a[..., 0, 1] * a[..., 1, 0]
-    return sum(a[..., 0, j] * _minor(a, 0, j) for j in range(3))
+    first, second, third = (a[..., 0, j] * _minor(a, 0, j) for j in range(3))
+    return first + second + third
 
 
 def norm(vectors: Float[Array, "... dim"]) -> Float[Array, ...]:

@@ -72,7 +72,7 @@ class _Iterate(NamedTuple):
     rho: Float[Array, ""]
     square: Float[Array, ""]
     confirmed: Float[Array, ""]
-    count: Int[Array, ""]
+    iterations: Int[Array, ""]
     restarts: Int[Array, ""]
     check: Bool[Array, ""]
     done: Bool[Array, ""]
@@ -108,8 +108,8 @@ def conjugate_gradients(
         z = precondition(r)
         rho, square = jnp.vdot(r, z), jnp.vdot(r, r)
         turn = jnp.where(s.check | ~(s.rho > 0), 0, rho / jnp.where(s.rho > 0, s.rho, 1))
-        count = s.count + ~s.check
-        full = count >= bound
+        iterations = s.iterations + ~s.check
+        full = iterations >= bound
         helped = (square < s.confirmed / 4) & (s.restarts < _RESTARTS)
         return _Iterate(
             x,
@@ -118,7 +118,7 @@ def conjugate_gradients(
             rho,
             square,
             confirmed=jnp.where(s.check, square, s.confirmed),
-            count=count,
+            iterations=iterations,
             restarts=s.restarts + s.check,
             check=~s.check & (~(square > goal) | full),
             done=s.check & (~(square > goal) | full | ~helped),
@@ -129,7 +129,7 @@ def conjugate_gradients(
     start = _Iterate(jnp.zeros_like(b), b, z, jnp.vdot(b, z), unit, unit, zero, zero, no, ~(unit > goal))
     end = jax.lax.while_loop(lambda s: ~s.done, iterate, start)
     residual = jnp.sqrt(end.square / jnp.where(empty, 1, unit))
-    return Solution(end.x * jnp.where(empty, 0, size), end.count, residual)
+    return Solution(end.x * jnp.where(empty, 0, size), end.iterations, residual)
 
 
 def apply_blocks(blocks: Float[Array, "nodes dim dim"], field: Field) -> Field:
@@ -192,8 +192,11 @@ def _solve_jvp(primals, tangents):
 
     _, change = jax.jvp(residual, (system,), tangents[:1])
     matvec, _, solver = _equations(system, tolerance, max_iterations)
-    slope, _ = jax.lax.custom_linear_solve(matvec, change, solver, symmetric=True, has_aux=True)
-    iterations = np.zeros((), jax.dtypes.float0)
+    # JAX annotates no result
+    slope, _ = jax.lax.custom_linear_solve(  # pyright: ignore[reportGeneralTypeIssues]
+        matvec, change, solver, symmetric=True, has_aux=True
+    )
+    iterations: Any = np.zeros((), jax.dtypes.float0)  # the tangent of an integer is NumPy's
     return solution._replace(field=field), Solution(slope, iterations, jnp.zeros_like(solution.residual))
 
 

@@ -25,7 +25,7 @@ _INK, _BEFORE, _AFTER = "#1d2b36", "#c8502d", "#1f6f8b"
 _QUALITY = LinearSegmentedColormap.from_list(
     "quality", ["#a3122e", "#e8743b", "#f6d55c", "#b9dcd2", "#f4f8f7"]
 )
-_BINS = np.linspace(0, 1, 21)
+_BINS = np.linspace(0, 1, 21).tolist()
 
 
 def before_after(before: Mesh, after: Mesh, title: str = "", view: tuple[float, float] = (-55, 28)) -> Figure:
@@ -154,4 +154,5 @@ def _element_facets(
         shade.append(0.72 + 0.28 * np.abs(normal[seen] @ light))
         values.append(q[seen])
     empty = np.zeros(0)
-    return shapes, *(np.concatenate(part) if part else empty for part in (depth, shade, values))
+    joined = [np.concatenate(part) if part else empty for part in (depth, shade, values)]
+    return shapes, joined[0], joined[1], joined[2]

@@ -69,9 +69,9 @@ _compiling = [0.0]
 def _compile_seconds() -> float:
     if not _compiling[1:]:
 
-        def listen(event: str, duration: float, **_: Any) -> None:
+        def listen(event: str, duration_secs: float, **_: Any) -> None:
             if event in ("/jax/core/compile/backend_compile_duration", _LOWERING):
-                _compiling[0] += duration
+                _compiling[0] += duration_secs
 
         jax.monitoring.register_event_duration_secs_listener(listen)
         _compiling.append(1.0)

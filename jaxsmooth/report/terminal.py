@@ -64,8 +64,9 @@ def write_to_standard_output(text: str) -> None:
 
 def close_standard_output() -> None:
     """Python flushes once more at its end: what failed before would fail again, with a traceback."""
+    if sys.stdout is None:
+        return
     try:
-        if sys.stdout is not None:
-            sys.stdout.flush()
+        sys.stdout.flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
 from typing import Any
 
 import equinox as eqx
@@ -46,8 +47,8 @@ class Batch(eqx.Module):
 
     def mean(self, values: tuple[Float[Array, "_ _"], ...]) -> Float[Array, " _"]:
         """Mean over the real elements of each mesh, of values given block by block."""
-        total = sum(jnp.where(m, v, 0).sum(axis=1) for m, v in zip(self.elements, values, strict=True))
-        return total / sum(m.sum(axis=1) for m in self.elements)
+        sums = [jnp.where(m, v, 0).sum(axis=1) for m, v in zip(self.elements, values, strict=True)]
+        return reduce(jnp.add, sums) / reduce(jnp.add, [m.sum(axis=1) for m in self.elements])
 
 
 def stack(meshes: Sequence[Any], constraints: Sequence[Motion] | None = None) -> Batch:
@@ -67,12 +68,14 @@ def stack(meshes: Sequence[Any], constraints: Sequence[Motion] | None = None) ->
     if not meshes or len({mesh.dim for mesh in meshes}) > 1:
         raise ValueError("stack needs meshes of one dimension, at least one")
     constraints = [detect_constraints(m) for m in meshes] if constraints is None else constraints
+    motions: list[Constraints] = []
     for index, motion in enumerate(constraints):
         if not isinstance(motion, Constraints):
             raise ValueError(
                 f"stack pads Constraints, and mesh {index} has {type(motion).__name__}; where its nodes move "
                 "together, hold them: Constraints.hold(mesh, mesh.labels.links.members(len(mesh.points)))"
             )
+        motions.append(motion)
     types = sorted({name for mesh in meshes for name in mesh.types})
     kinds = [element_type(name) for name in types]
     joined = [{name: [] for name in types} for _ in meshes]
@@ -85,7 +88,7 @@ def stack(meshes: Sequence[Any], constraints: Sequence[Motion] | None = None) ->
     dim = meshes[0].dim
 
     rows = []
-    for mesh, held, blocks in zip(meshes, constraints, joined, strict=True):
+    for mesh, held, blocks in zip(meshes, motions, joined, strict=True):
         count = len(mesh.points)
         dtype = mesh.points.dtype
         ghosts = np.concatenate([kind.ideal for kind in kinds]).astype(dtype)

@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxsmooth.convert.meshfile import as_mesh
@@ -110,7 +111,7 @@ def smooth(
         TypeError: for points that JAX traces; use `run`.
     """
     mesh = as_mesh(mesh)
-    if isinstance(mesh.points, jax.core.Tracer):
+    if isinstance(mesh.points, Tracer):
         raise TypeError(
             "smooth decides on the host when to stop, so JAX can't trace it; inside jit, grad or vmap use "
             "run(mesh, method, constraints=constraints, steps=3), with constraints found beforehand"

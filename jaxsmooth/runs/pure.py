@@ -11,6 +11,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxsmooth.convert.meshfile import as_mesh
@@ -43,7 +44,7 @@ def _before(mesh: Mesh) -> Evaluation:
 
 def _state(method: Method, mesh: Mesh) -> Any:
     """The state of the method, where the connectivity is known on the host."""
-    traced = any(isinstance(nodes, jax.core.Tracer) for nodes in mesh.connectivity)
+    traced = any(isinstance(nodes, Tracer) for nodes in mesh.connectivity)
     return None if traced else method.init(mesh)
 
 
@@ -129,7 +130,8 @@ def run(
     mesh = mesh.with_points(points)
     evaluation = evaluate(mesh)
     least = jnp.stack([part.min() for part in evaluation.jacobian]).min()
-    return Run(mesh, evaluation, *counts, least)
+    residuals, iterations, shortened = counts
+    return Run(mesh, evaluation, residuals, iterations, shortened, least)
 
 
 class FixedPoint(eqx.Module):
@@ -174,7 +176,7 @@ def fixed_point(
     mesh = as_mesh(mesh)
     method = Elastic() if method is None else method
     state = _state(method, mesh)
-    method = eqx.tree_at(lambda m: m.guard, method, None, is_leaf=lambda x: x is None)
+    bare = eqx.tree_at(lambda m: m.guard, method, None, is_leaf=lambda x: x is None)
     stopped = jax.lax.stop_gradient
     points = mesh.points
     extent = stopped(jnp.ptp(points, axis=0).max())
@@ -187,7 +189,7 @@ def fixed_point(
         return motion.at(points).independent(after - points)
 
     def search(u: Field):
-        fixed = stopped((method, points, constraints))
+        fixed = stopped((bare, points, constraints))
 
         def unfinished(state):
             _, change, count = state
@@ -201,7 +203,7 @@ def fixed_point(
         return jax.lax.while_loop(unfinished, again, (u, jnp.asarray(jnp.inf, u.dtype), jnp.int32(0)))
 
     u, change, count = search(jnp.zeros_like(points))
-    u = _implicit(displaced, u, (method, points, constraints), tolerance, max_steps)
+    u = _implicit(displaced, u, (bare, points, constraints), tolerance, max_steps)
     return FixedPoint(mesh.with_points(place(u, points, constraints)), count, change)
 
 

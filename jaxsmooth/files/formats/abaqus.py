@@ -108,7 +108,7 @@ def patch_abaqus(
             changed |= changed.any(axis=1, keepdims=True)
         before.append(own)
         after.append(np.where(changed, in_part(part, new[rows].astype(np.float64)), own))
-        for span in part.spans:
+        for span in filter(None, part.spans):  # none is None, see above
             found = node_places(source.content, *span)
             starts.append(found.starts)
             ends.append(found.ends)

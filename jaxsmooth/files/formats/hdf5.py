@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import io
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxsmooth.files.formats.record import UnpatchableError
+
+if TYPE_CHECKING:
+    import h5py
 
 __all__ = ["is_hdf5", "read_array", "replace_array"]
 
@@ -21,7 +25,7 @@ def read_array(content: bytes, path: str) -> np.ndarray:
     import h5py
 
     with h5py.File(io.BytesIO(content), "r") as file:
-        return file[path][()]
+        return np.asarray(_dataset(file, path)[()])
 
 
 def replace_array(content: bytes, path: str, values: np.ndarray) -> bytes:
@@ -35,10 +39,10 @@ def replace_array(content: bytes, path: str, values: np.ndarray) -> bytes:
 
     buffer = io.BytesIO(content)
     with h5py.File(buffer, "r+") as file:
-        array = file[path]
+        array = _dataset(file, path)
         if array.shape != values.shape or array.dtype.kind != "f":
             raise UnpatchableError(f"its array {path} is {list(array.shape)} of {array.dtype}")
-        before = array[()]
+        before = np.asarray(array[()])
         if np.array_equal(before, values.astype(array.dtype)):
             return content
         offset, size = array.id.get_offset(), array.dtype.itemsize * values.size
@@ -47,3 +51,12 @@ def replace_array(content: bytes, path: str, values: np.ndarray) -> bytes:
             return content[:offset] + data + content[offset + size :]
         array[...] = values
     return buffer.getvalue()
+
+
+def _dataset(file: h5py.File, path: str) -> h5py.Dataset:
+    import h5py
+
+    array = file[path]
+    if not isinstance(array, h5py.Dataset):
+        raise UnpatchableError(f"its {path} is not an array")
+    return array

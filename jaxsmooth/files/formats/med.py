@@ -29,7 +29,10 @@ def patch_med(
 
     paths: list[str] = []
     with h5py.File(io.BytesIO(source.content), "r") as file:
-        file["ENS_MAA"].visit(lambda name: paths.append(name) if name.endswith("NOE/COO") else None)
+        group = file["ENS_MAA"]
+        if not isinstance(group, h5py.Group):
+            raise UnpatchableError("its ENS_MAA is not a group")
+        group.visit(lambda name: paths.append(name) if name.endswith("NOE/COO") else None)
     if len(paths) != 1:
         raise UnpatchableError(f"it has coordinates of {len(paths)} meshes or steps")
     path = f"ENS_MAA/{paths[0]}"

@@ -52,7 +52,8 @@ def write_npz(path: Path, mesh: meshio.Mesh, dim: int, variant: str = "") -> lis
         for key, parts in mesh.cell_data.items():
             arrays[f"{name}/{key}"] = np.concatenate([parts[k] for k in own])
     with open(path, "wb") as out:
-        np.savez_compressed(out, **arrays)
+        # no array is called allow_pickle
+        np.savez_compressed(out, **arrays)  # pyright: ignore[reportArgumentType]
     return []
 
 

@@ -194,7 +194,7 @@ def write_unv(path: Path, mesh: meshio.Mesh, dim: int, variant: str = "") -> lis
         for start, cells, own in zip(starts, mesh.cells, tags, strict=False):
             nodes = cells.data[:, _ORDER[cells.type]] if cells.type in _ORDER else cells.data
             for number, (row, tag) in enumerate(
-                zip((nodes + 1).tolist(), own.tolist(), strict=True), start + 1
+                zip((nodes + 1).tolist(), own.tolist(), strict=True), int(start) + 1
             ):
                 head = (number, _CODES[cells.type], tag, 1, 7, len(row))
                 beam = f"{0:10d}{1:10d}{1:10d}\n" if _CODES[cells.type] in _BEAMS else ""

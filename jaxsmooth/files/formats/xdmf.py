@@ -43,7 +43,8 @@ def read_xdmf(path: Path) -> tuple[meshio.Mesh, list[str]]:
                 at += 1
     version = root.attrib.get("Version", "3")
     read = reader.read_xdmf2 if version.startswith("2") else reader.read_xdmf3
-    return read(root), notes
+    # meshio's own annotations of its Mesh say less than typings/
+    return read(root), notes  # pyright: ignore[reportReturnType]
 
 
 def _split_mixed(numbers: np.ndarray, types: dict[int, str]) -> Iterator[tuple[str, np.ndarray]]:

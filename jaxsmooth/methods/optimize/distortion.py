@@ -84,7 +84,7 @@ def _sampled(kind: ElementType, metric: str) -> bool:
 class _Volume(NamedTuple):
     """Regularised measure, and its gradient ``[k, dim]``."""
 
-    value: Scalar
+    value: Float[Array, ""]
     gradient: Nodes
 
 
@@ -100,7 +100,7 @@ def _volume(kind: ElementType, nodes: Nodes, size: Scalar, eps: Scalar) -> _Volu
 class _Surface(NamedTuple):
     """Perimeter or surface area, its gradient, and ``pull``: areas times inverse metrics."""
 
-    value: Scalar
+    value: Float[Array, ""]
     gradient: Nodes
     pull: Float[Array, "s j j"]
 
@@ -134,7 +134,7 @@ class Samples(NamedTuple):
 
 def _samples(
     kind: ElementType, metric: str, nodes: Nodes, size: Scalar, eps: Scalar
-) -> tuple[Scalar, Nodes, Samples]:
+) -> tuple[Float[Array, ""], Nodes, Samples]:
     """Mean over the sample points of ``|A|² / (d det(A)^(2/d))``, its gradient, and the samples."""
     dim = kind.dim
     points = jnp.asarray(sample_gradients(kind), nodes.dtype)
@@ -162,7 +162,7 @@ def _samples(
     return (unit * square).sum(), gradient, samples
 
 
-def _size_weight(size_weight: Scalar, eps: Scalar, stretch: Scalar) -> Scalar:
+def _size_weight(size_weight: Scalar, eps: Scalar, stretch: Float[Array, ""]) -> Float[Array, ""]:
     """With ε, metrics without size would be best for elements that vanish."""
     return size_weight + jnp.where(stretch < 1, _KEEP * eps, 0)
 
@@ -170,7 +170,7 @@ def _size_weight(size_weight: Scalar, eps: Scalar, stretch: Scalar) -> Scalar:
 class _Metric(NamedTuple):
     """e, its gradient, and what the Hessian model needs."""
 
-    value: Scalar
+    value: Float[Array, ""]
     gradient: Nodes
     volume: _Volume
     surface: _Surface | None
@@ -205,7 +205,7 @@ def _metric(kind: ElementType, metric: str, size_weight, nodes: Nodes, size, eps
 
 def inverse_quality(
     kind: ElementType, metric: str, size_weight: Scalar, nodes: Nodes, size: Scalar, eps: Scalar
-) -> tuple[Scalar, Nodes]:
+) -> tuple[Float[Array, ""], Nodes]:
     """e ≥ 1 of one element, and its gradient ``[k, dim]``.
 
     For ε = 0 and no size weight 1/e is the metric of `jaxsmooth.metrics.shape` of the same name, which
@@ -252,11 +252,11 @@ def hessian_model(
     kind: ElementType,
     metric: str,
     size_weight: Scalar,
-    aggregate: Callable[[Scalar], tuple[Scalar, Scalar]],
+    aggregate: Callable[[Array], tuple[Array, Array]],
     nodes: Nodes,
     size: Scalar,
     eps: Scalar,
-) -> tuple[Scalar, Nodes, Model]:
+) -> tuple[Float[Array, ""], Nodes, Model]:
     """Positive semi-definite model of the Hessian of φ(e) of one element.
 
     Left out: the second derivative of the determinant, and φ″ where negative.  Surfaces enter by

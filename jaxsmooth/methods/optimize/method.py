@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxsmooth.guards.acceptance import AcceptanceRule
 from jaxsmooth.guards.base import Guard
 from jaxsmooth.guards.patch import PatchGuard
 from jaxsmooth.mesh.record import Mesh
@@ -20,7 +21,7 @@ from jaxsmooth.methods.elastic.method import Elastic
 from jaxsmooth.methods.optimize.distortion import METRICS
 from jaxsmooth.methods.optimize.goals import BALANCED, GOALS, UNTANGLE, Goal
 from jaxsmooth.methods.optimize.minimise import Minimiser, Newton
-from jaxsmooth.methods.optimize.problem import Aggregation, Problem, Scalar, problem
+from jaxsmooth.methods.optimize.problem import Aggregation, Problem, problem
 from jaxsmooth.metrics.evaluation import Evaluation
 from jaxsmooth.metrics.record import Metric
 from jaxsmooth.metrics.shape import SHAPE_AND_CORNERS
@@ -109,8 +110,9 @@ class Optimize(Method):
         """The objective is trusted first, for it has a barrier of its own; then as for other methods."""
         if not isinstance(self.guard, PatchGuard):
             return (self,)
-        usual = {"poor": POOR, "corner": PatchGuard().corner}
-        return (self, self._looser()[0], self._guarded(**usual), self._guarded(**usual, keep=1.0))
+        guard, usual = self.guard, {"poor": POOR, "corner": PatchGuard().corner}
+        mended = self._guarded(guard, **usual), self._guarded(guard, **usual, keep=1.0)
+        return (self, self._looser(guard)[0], *mended)
 
     def propose(self, mesh: Mesh, motion: Motion, before: Evaluation, state: Any = None) -> Proposal:
         """The displacement to the optimised mesh."""
@@ -142,7 +144,7 @@ class Optimize(Method):
         worst = jnp.where(helped, looks.ordered[1, -1], looks.ordered[0, -1])
         return _Start(mesh.with_points(points), motion, evaluation, worst)
 
-    def _stages(self, task: Problem, start: _Start, hopeless: Any, tangled: Scalar) -> _State:
+    def _stages(self, task: Problem, start: _Start, hopeless: Any, tangled: Array) -> _State:
         """One minimisation after another; one copy of each function in the compiled program."""
         stages = (UNTANGLE,) * self.untangling_stages + self.goal.stages
         stages = jax.tree.map(lambda *values: jnp.stack([jnp.asarray(v) for v in values]), *stages)
@@ -186,7 +188,8 @@ class Optimize(Method):
         self, mesh: Mesh, motion: Motion, before: Evaluation, state: Any
     ) -> tuple[Float[Array, "nodes dim"], Evaluation]:
         """The points after the steps of the starting method, and their evaluation."""
-        if self.start is None:
+        start = self.start
+        if start is None:
             return mesh.points, before
 
         def unfinished(carry):
@@ -196,7 +199,7 @@ class Optimize(Method):
 
         def step(carry):
             points, before, count = carry
-            found = self.start.step(mesh.with_points(points), motion, before, state)
+            found = start.step(mesh.with_points(points), motion, before, state)
             return found.points, found.evaluation, count + 1
 
         return jax.lax.while_loop(unfinished, step, (mesh.points, before, jnp.int32(0)))[:2]

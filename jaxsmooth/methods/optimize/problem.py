@@ -9,7 +9,7 @@ Elements stand in `jaxsmooth.methods.optimize.distortion`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -51,10 +51,10 @@ class Aggregation(eqx.Module):
     penalty on everything worse than the pivot as the power rises (a p-norm continuation).
     """
 
-    average: Scalar | float
-    worst: Scalar | float
-    power: Scalar | float
-    pivot: Scalar | float = 1.0
+    average: Scalar
+    worst: Scalar
+    power: Scalar
+    pivot: Scalar = 1.0
 
     def __call__(self, e: Float[Array, "..."]) -> Float[Array, "..."]:
         """φ(e)."""
@@ -105,7 +105,7 @@ class Problem(eqx.Module):
     motion: Motion
     blocks: tuple[Chunks, ...]
     aggregation: Aggregation
-    size_weight: Scalar
+    size_weight: Float[Array, ""]
     kinds: tuple[ElementType, ...] = eqx.field(static=True)
     metric: str = eqx.field(static=True)
 
@@ -127,9 +127,10 @@ class Problem(eqx.Module):
             batch = jax.vmap(jax.vmap(function, in_axes=(0, 0, None)), in_axes=(0, 0, None))
             corners = _whole(kind, block.data.weight, gather(points, block.nodes))
             found.append((batch(corners, block.data.size, jnp.zeros((), points.dtype))[0], block.data.weight))
-        return tuple(
+        e, weight = (
             jnp.concatenate([part.reshape(-1) for part in side]) for side in zip(*found, strict=True)
         )
+        return e, weight
 
     def determinants(self, points: Field) -> tuple[Float[Array, "_ _"], ...]:
         """The least determinant of every element over its target's; ∞ for those without weight."""
@@ -141,7 +142,7 @@ class Problem(eqx.Module):
 
         return tuple(found(kind, block) for kind, block in zip(self.kinds, self.blocks, strict=True))
 
-    def least(self, points: Field) -> Scalar:
+    def least(self, points: Field) -> Float[Array, ""]:
         """The least of all determinants, but for those of elements that are given up."""
         dets = self.determinants(points)
         return jnp.stack(
@@ -165,10 +166,11 @@ class Problem(eqx.Module):
 
         return tuple(found(kind, block) for kind, block in zip(self.kinds, self.blocks, strict=True))
 
-    def inverted(self, points: Field, but: tuple[Bool[Array, "_ _"], ...]) -> Scalar:
+    def inverted(self, points: Field, but: tuple[Bool[Array, "_ _"], ...]) -> Float[Array, ""]:
         """The number of inverted elements, but for some."""
         dets = self.determinants(points)
-        return sum(((det <= 0) & ~out).sum(dtype=det.dtype) for det, out in zip(dets, but, strict=True))
+        counts = [((det <= 0) & ~out).sum(dtype=det.dtype) for det, out in zip(dets, but, strict=True)]
+        return reduce(jnp.add, counts)
 
     def giving_up(self, points: Field, elements: tuple[Bool[Array, "_ _"], ...]) -> Problem:
         """The problem in which those of the elements that are inverted do not stop the others."""
@@ -179,7 +181,7 @@ class Problem(eqx.Module):
         ]
         return eqx.tree_at(lambda task: [block.data.relief for block in task.blocks], self, relief)
 
-    def value(self, points: Field, eps: Scalar) -> tuple[Scalar, Scalar]:
+    def value(self, points: Field, eps: Scalar) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """The objective, and the least determinant over its target's (of weighted elements)."""
 
         def add(carry, kind, chunk):
@@ -198,7 +200,7 @@ class Problem(eqx.Module):
 
         return self._scan(add, (jnp.zeros((), points.dtype), jnp.full((), jnp.inf, points.dtype)), points)
 
-    def value_and_grad(self, points: Field, eps: Scalar) -> tuple[Scalar, Field]:
+    def value_and_grad(self, points: Field, eps: Scalar) -> tuple[Float[Array, ""], Field]:
         """The objective and its gradient with respect to all points."""
 
         def add(carry, kind, chunk):
@@ -259,7 +261,7 @@ class Problem(eqx.Module):
         return total
 
 
-def _least_determinant(kind: ElementType, nodes: Array) -> Scalar:
+def _least_determinant(kind: ElementType, nodes: Array) -> Float[Array, ""]:
     return determinant(contract(nodes, jnp.asarray(kind.validity_gradients, nodes.dtype))).min()
 
 
@@ -284,7 +286,7 @@ def problem(
     sizes: tuple[Float[Array, " _"], ...],
     aggregation: Aggregation,
     metric: str = "shape_and_corners",
-    size_weight: Scalar | float = 0.0,
+    size_weight: Scalar = 0.0,
 ) -> Problem:
     """The objective of a mesh.
 

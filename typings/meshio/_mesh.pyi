@@ -1,0 +1,1 @@
+topological_dimension: dict[str, int]
