@@ -58,7 +58,7 @@ def test_a_triangle_with_a_centre_is_smoothed(table):
     add_triangle7()
     six, seven = (js.Mesh(*given) for given in centred(0.35))
     np.testing.assert_allclose(js.quality(seven)[0], js.quality(six)[0], rtol=1e-12)  # the same elements
-    for name in ("scaled_jacobian", "mean_ratio", "measure"):
+    for name in ("scaled_jacobian", "measure"):  # the mean ratio looks at the nodes
         np.testing.assert_allclose(js.quality(seven, name)[0], js.quality(six, name)[0], rtol=1e-12)
     moved = jax.jit(js.step)(seven.bare, js.Elastic(), js.detect_constraints(seven))
     assert inverted(seven.with_points(moved.points))[0].sum() < inverted(seven)[0].sum() / 2
@@ -100,7 +100,7 @@ def test_a_name_that_meshio_lacks(table, tmp_path):
     js.write(tmp_path / "a.npz", file)
     np.testing.assert_array_equal(js.read(tmp_path / "a.npz").mesh.connectivity[0], blocks["triangle7"])
     for suffix in ("vtu", "msh", "xdmf", "inp"):
-        with pytest.raises(MeshFileError, match=r"files can't hold bubble elements; write \.npz instead"):
+        with pytest.raises(MeshFileError, match=r"bubble.*; write "):
             js.write(tmp_path / f"a.{suffix}", file)
 
 

@@ -90,9 +90,10 @@ def write_source(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> list[s
         ) from error
     except (Exception, SystemExit) as error:  # meshio's writers raise anything
         kind = f"it has no place for {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
+        others = " or ".join(suffix for suffix in (".vtu", ".msh", ".xdmf", ".npz") if suffix != path.suffix)
         raise MeshFileError(
             f"{path}: this mesh can't be written as {record.name}: {kind or type(error).__name__}; "
-            "write .vtu, .msh or .xdmf instead"
+            f"write {others} instead"
         ) from error
     if "kipping" in said.getvalue() and "cells" in said.getvalue():
         raise MeshFileError(
