@@ -1,0 +1,214 @@
+"""What each node of the boundary slides on: a plane, a line, a curved face, a curve, or nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsmooth.mesh.topology import lengths
+from jaxsmooth.motion.curved import Carrier, Patches, Sliding
+from jaxsmooth.motion.curves import Curves, Layout, find_curves
+from jaxsmooth.motion.directions import Noise, facet_normals
+from jaxsmooth.motion.features import Faces, find_faces
+from jaxsmooth.motion.given import given
+from jaxsmooth.motion.planar import Constraints
+from jaxsmooth.motion.sides import Segments, Sides, pair_codes
+from jaxsmooth.motion.surfaces import build_surfaces
+
+__all__ = ["Kept", "find_sliding"]
+
+_REACH = 4.0  # edges that a node may move in a step
+_ALONG = np.cos(0.05)  # an edge that is off a straight line by more is not on it
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What is kept of a mesh while nodes slide.
+
+    Attributes:
+        points: ``[nodes, dim]``.
+        noise: of the points.
+        projectors: the planar rule's, for all nodes ``[nodes, dim, dim]``.
+        flat: nodes whose facets all lie in one plane ``[nodes]``.
+        sides: the facets whose shape is kept.
+        lines: tagged lines.
+        held: nodes that stay ``[nodes]``.
+        bound: nodes that keep what the planar rule says ``[nodes]``.
+        surfaces: a mask ``[nodes]`` and a function for each given surface.
+    """
+
+    points: np.ndarray
+    noise: Noise
+    projectors: np.ndarray
+    flat: np.ndarray
+    sides: list[Sides]
+    lines: list[Segments]
+    held: np.ndarray
+    bound: np.ndarray
+    surfaces: list[tuple[np.ndarray, Callable[[Any], Any]]]
+
+
+def find_sliding(
+    kept: Kept, feature_angle: float, tolerance: float, flatness: float | None, dtype: Any
+) -> Constraints | Sliding:
+    """The motion of all nodes: `Constraints` where nothing is curved.
+
+    Args:
+        kept: what is kept.
+        feature_angle: in degrees.
+        tolerance: how far curved surfaces may be off the facets, over the local length of edges.
+        flatness: angle below which facets lie in one plane; None for what the noise says.
+        dtype: of the motion.
+    """
+    points, dim = kept.points, kept.points.shape[1]
+    quads = any(part.type.linear and part.type.corners == 4 for part in kept.sides)
+    share = (0.5 if quads else 0.75) if dim == 3 else 1.0  # bulges of the edges of a facet add up inside
+    faces = None
+    if dim == 3 and kept.sides:
+        known = [facet_normals(p.type, points[p.nodes], kept.noise.at(p.nodes), flatness) for p in kept.sides]
+        lines = np.concatenate([np.zeros((0, 2), int), *(part.ends for part in kept.lines)])
+        precise = np.concatenate([part.tolerance for part in known])
+        faces = find_faces(kept.sides, points, kept.flat, precise, lines, feature_angle)
+        parts = [faces.edges.segments.select(faces.feature), *kept.lines]
+    elif dim == 2:
+        parts = [*(segments for segments, _ in _plane_segments(kept)), *kept.lines]
+    else:
+        parts = list(kept.lines)
+    if not sum(len(part.ends) for part in parts):
+        curves, straight, on_line = None, np.zeros(len(points), bool), np.zeros(len(points), bool)
+    else:
+        segments = Segments.join(parts).once(len(points))
+        straight, on_line = _straight(kept, segments)
+        curves = find_curves(segments, points, straight, feature_angle, tolerance * share)
+    roles = _roles(kept, faces, curves, straight, on_line)
+    return _motion(kept, faces, curves, roles, (feature_angle, tolerance * share), dtype)
+
+
+def _plane_segments(kept: Kept) -> list[tuple[Segments, np.ndarray]]:
+    """The facets of a plane mesh, and the given curve that each lies on."""
+    from jaxsmooth.motion.sides import segments_of
+
+    return [(segments_of(p.type, p.nodes, kept.points), p.given) for p in kept.sides]
+
+
+def _straight(kept: Kept, segments: Segments) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes that the planar rule lets slide along all segments at them, and nodes of segments."""
+    count = len(kept.points)
+    one = np.rint(np.trace(kept.projectors, axis1=1, axis2=2)) == 1
+    nodes = np.concatenate([segments.ends, segments.inner], axis=1)
+    chord = kept.points[segments.ends[:, 1]] - kept.points[segments.ends[:, 0]]
+    ways = np.stack([segments.leave[:, 0], segments.leave[:, 1], *[chord] * segments.inner.shape[1]], axis=1)
+    there, nodes = nodes >= 0, np.maximum(nodes, 0)
+    square = np.einsum("mnd,mnd->mn", ways, ways)
+    along = np.einsum("mni,mnij,mnj->mn", ways, kept.projectors[nodes], ways) >= _ALONG**2 * square
+    on_line, crooked = np.zeros(count, bool), np.zeros(count, bool)
+    on_line[nodes[there]] = True
+    crooked[nodes[there & ~along]] = True
+    ends = np.bincount(segments.ends.reshape(-1), minlength=count)
+    inner = np.zeros(count, bool)
+    inner[segments.inner[segments.inner >= 0]] = True
+    return one & on_line & ~crooked & ((ends >= 2) | inner), on_line
+
+
+@dataclass(frozen=True)
+class _Roles:
+    """Masks ``[nodes]``: what slides along curves, on curved faces, and on each given surface."""
+
+    along: np.ndarray
+    on: np.ndarray
+    given: list[np.ndarray]
+    alone: np.ndarray  # nodes of given surfaces of which nothing else is known
+    lost: np.ndarray  # nodes of edges that are neither straight nor curves
+
+
+def _roles(
+    kept: Kept, faces: Faces | None, curves: Curves | None, straight: np.ndarray, on_line: np.ndarray
+) -> _Roles:
+    count = len(kept.points)
+    none = np.zeros(count, bool)
+    free = ~kept.held & ~kept.bound
+    if curves is not None:
+        free_along = curves.smooth & ~straight & free
+    else:
+        free_along = none
+    touched, curved, beside, fans = none.copy(), none.copy(), none.copy(), none.copy()
+    whose = [none.copy() for _ in kept.surfaces]
+    facet = 0
+    for part in kept.sides:
+        touched[part.nodes] = True
+        beside[part.nodes[part.given < 0]] = True
+        for index, mask in enumerate(whose):
+            mask[part.nodes[part.given == index]] = True
+        if faces is not None:
+            here = slice(facet, facet + len(part.nodes))
+            curved[part.nodes[~faces.flat[here] & (part.given < 0)]] = True
+        facet += len(part.nodes)
+    if faces is not None:
+        pairs = np.unique(np.c_[faces.edges.node, faces.vertex], axis=0)
+        fans = np.bincount(pairs[:, 0], minlength=count) > 1
+    # in the plane the line itself may be given
+    on_feature = on_line if faces is not None else on_line & beside
+    several = sum(mask.astype(int) for mask in whose) > 1 if whose else none
+    inside = [
+        (mask & ~on_feature & ~fans & ~several) | (named & ~touched & ~on_line)
+        for mask, (named, _) in zip(whose, kept.surfaces, strict=True)
+    ]
+    alone = np.any(inside, axis=0) & free if inside else none
+    along = free_along & ~alone
+    tied = along | (straight & free)
+    given_nodes = [
+        (one & free) | (mask & tied & (faces is not None)) for one, mask in zip(inside, whose, strict=True)
+    ]
+    on = curved & ~on_feature & ~kept.flat & ~fans & free & ~alone
+    lost = (on_line & ~straight & ~along & ~alone) | (fans & ~on_line)
+    return _Roles(along, on, given_nodes, alone, lost & ~kept.bound)
+
+
+def _motion(
+    kept: Kept,
+    faces: Faces | None,
+    curves: Curves | None,
+    roles: _Roles,
+    bounds: tuple[float, float],
+    dtype: Any,
+) -> Constraints | Sliding:
+    points, dim = kept.points, kept.points.shape[1]
+    carriers: list[Carrier] = []
+    if curves is not None and roles.along.any():
+        carriers.append(_patches(curves.layout, roles.along, _reach(points, curves.segments.ends), dtype))
+    if faces is not None and roles.on.any():
+        ends = pair_codes(np.zeros((0, 2), int), 1), np.zeros((0, 3))
+        if curves is not None:
+            ends = pair_codes(curves.segments.ends, len(points)), curves.bulge
+        angle, bound = bounds
+        layout = build_surfaces(kept.sides, faces, points, ends, bound, np.deg2rad(angle))
+        carriers.append(_patches(layout, roles.on, _reach(points, faces.edges.segments.ends), dtype))
+    for mask, (_, nearest) in zip(roles.given, kept.surfaces, strict=True):
+        if mask.any():
+            carriers.append(given(np.flatnonzero(mask), nearest))
+    projectors = kept.projectors.copy()
+    projectors[roles.lost | kept.held] = 0
+    projectors[roles.along | roles.on | roles.alone] = np.eye(dim)
+    projectors = jnp.asarray(projectors, dtype)
+    return Sliding(projectors, tuple(carriers)) if carriers else Constraints(projectors)
+
+
+def _reach(points: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """The longest move of each node ``[nodes]``: some edges."""
+    total = np.bincount(pairs.reshape(-1), np.repeat(lengths(points, pairs), 2), len(points))
+    number = np.bincount(pairs.reshape(-1), minlength=len(points))
+    mean = total.sum() / max(number.sum(), 1)
+    return _REACH * np.where(number > 0, total / np.maximum(number, 1), mean)
+
+
+def _patches(layout: Layout, mask: np.ndarray, reach: np.ndarray, dtype: Any) -> Patches:
+    located = layout.located.select(mask)
+    whole = (jnp.asarray(a, jnp.int32) for a in (located.nodes, located.home, layout.vertices, layout.neighbours))
+    real = (jnp.asarray(a, dtype) for a in (located.start, reach[located.nodes], layout.corners, layout.bulges))
+    nodes, home, vertices, neighbours = whole
+    start, longest, corners, bulges = real
+    return Patches(nodes, home, start, longest, vertices, neighbours, corners, bulges)
