@@ -51,7 +51,7 @@ def detect_constraints(
         boundary: ``"slide"``; ``"planar"`` to hold the nodes of what is curved; or ``"fixed"`` to hold every
             boundary node.
         interfaces: the same choice for interfaces between regions.
-        feature_angle: degrees.  A sharper fold, or bend of a curve, is an edge (a corner) of the shape; 40 by
+        feature_angle: degrees.  A sharper fold, or bend of a curve, is an edge (a corner) of the shape; 50 by
             default.  With ``"planar"``: a straight fold that is shallower belongs to a curved face, whose
             nodes are held; by default every straight fold is an edge to slide along.
         flatness: angle in radians below which facets lie in one plane.  By default it follows

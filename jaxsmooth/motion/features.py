@@ -13,8 +13,9 @@ from jaxsmooth.motion.sides import Edges, Sides
 
 __all__ = ["FEATURE_ANGLE", "Faces", "find_faces"]
 
-FEATURE_ANGLE = 40.0  # degrees: a fold that is an edge by itself
-_WEAK = 0.6  # part of that angle to which an edge goes on
+FEATURE_ANGLE = 50.0  # degrees: a fold that is an edge by itself
+_WEAK = 0.5  # part of that angle to which an edge goes on
+_BRANCH = 2  # edges that fade, and are too few to be an edge of their own
 _CHAIN = 3  # edges that a chain of folds needs, if it does not start at other features
 _CONTRAST, _SHALLOW = 4.0, np.deg2rad(8.0)  # a fold so many times sharper than all around it is an edge
 _LEVEL = 4.0  # tolerances by which a facet may be off the plane of its flat face
@@ -79,7 +80,8 @@ def find_faces(
     sure |= (given[one] != given[two]) | np.isin(codes, pair_codes(lines, len(points)))
     sure |= apart & ~within
     fold = np.where(sure | within, 0, angle)
-    feature = sure | _chains(edges, sure, *_folds(edges, fold, np.deg2rad(feature_angle)))
+    strong, weak = _folds(edges, fold, np.deg2rad(feature_angle))
+    feature = _pruned(edges, sure | _chains(edges, sure, strong, weak), sure, strong, fold)
     return Faces(edges, feature, flat, given, *_vertices(edges, ~feature))
 
 
@@ -127,6 +129,24 @@ def _chains(edges: Edges, sure: np.ndarray, strong: np.ndarray, weak: np.ndarray
     held = np.bincount(chain[weak], tied[ends[weak]].any(axis=1), count) > 0
     length = np.bincount(chain[weak], minlength=count) / 2  # both facets of an edge have a row
     return weak & (has & (held | (length >= _CHAIN)))[chain]
+
+
+def _pruned(
+    edges: Edges, feature: np.ndarray, sure: np.ndarray, strong: np.ndarray, fold: np.ndarray
+) -> np.ndarray:
+    """Features without the least sharp side of facets that are all edges, and without short side branches."""
+    sides, count = np.bincount(edges.facet), int(edges.node.max()) + 1
+    closed = (np.bincount(edges.facet, feature) == sides)[edges.facet] & feature & ~sure
+    least = np.full(len(sides), np.inf)
+    np.minimum.at(least, edges.facet[closed], fold[closed])
+    drop = closed & (fold <= least[edges.facet])
+    feature = feature & ~drop & ~(drop[edges.other] & (edges.other >= 0))
+    for _ in range(_BRANCH):
+        once = np.flatnonzero(feature)[np.unique(edges.same[feature], return_index=True)[1]]
+        number = np.bincount(edges.segments.ends[once].reshape(-1), minlength=count)
+        loose = feature & ~sure & ~strong & (number[edges.segments.ends] == 1).any(axis=1)
+        feature = feature & ~loose
+    return feature
 
 
 def _vertices(edges: Edges, joined: np.ndarray) -> tuple[np.ndarray, int]:

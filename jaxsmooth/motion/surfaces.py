@@ -145,7 +145,9 @@ def _edge_bulges(
     one, two = np.moveaxis(normals[faces.vertex[edges.corner]], 1, 0)
     mean = one + two
     mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-30)[:, None]
-    sine = np.einsum("rd,rd->r", chord, two - one) / (2 * np.where(size > 0, size, 1))
+    sines = [np.einsum("rd,rd->r", chord, n) / np.where(size > 0, size, 1) for n in (one, two)]
+    bend, swing = sines[1] - sines[0], sines[1] + sines[0]  # an arc has no swing; noise has as much as bend
+    sine = bend / 2 * bend**2 / np.where(bend == 0, 1, bend**2 + swing**2)
     local = np.bincount(ends.reshape(-1), np.repeat(size, 2), len(points))
     local /= np.maximum(np.bincount(ends.reshape(-1), minlength=len(points)), 1)
     limit = bound * np.minimum(size, local[ends].min(axis=1))
