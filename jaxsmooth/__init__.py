@@ -31,7 +31,9 @@ _HOMES = {
     "metrics.summary": ("Statistics", "statistics"),
     "metrics.table": ("METRICS", "quality", "quality_mean"),
     "motion.base": ("Motion",),
+    "motion.curved": ("Sliding",),
     "motion.detect": ("detect_constraints",),
+    "motion.given": ("host_nearest", "on_surface"),
     "motion.planar": ("Constraints",),
     "runs.batch": ("Batch", "stack"),
     "runs.driver": ("SmoothResult", "smooth"),
@@ -58,7 +60,9 @@ if TYPE_CHECKING:
     from jaxsmooth.metrics.summary import Statistics, statistics
     from jaxsmooth.metrics.table import METRICS, quality, quality_mean
     from jaxsmooth.motion.base import Motion
+    from jaxsmooth.motion.curved import Sliding
     from jaxsmooth.motion.detect import detect_constraints
+    from jaxsmooth.motion.given import host_nearest, on_surface
     from jaxsmooth.motion.planar import Constraints
     from jaxsmooth.runs.batch import Batch, stack
     from jaxsmooth.runs.driver import SmoothResult, smooth

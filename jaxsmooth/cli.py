@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from jaxsmooth.convert.meshfile import MeshFile
     from jaxsmooth.methods import Method
+    from jaxsmooth.motion.base import Motion
 
 __all__ = ["main"]
 
@@ -139,13 +140,15 @@ def _add_run_options(command: argparse.ArgumentParser) -> None:
     add("--steps", type=int, default=None, metavar="N", help=help)
     help = f"of the method optimize: one of {', '.join(_GOALS)} (default: balanced)"
     add("--goal", choices=_GOALS, default=None, metavar="NAME", help=help)
-    choices = ("slide", "fixed")
-    help = "what boundary nodes do: slide on flat faces and straight edges, or fixed (default: slide)"
-    add("--boundary", choices=choices, default="slide", help=help)
+    choices = ("slide", "planar", "fixed")
+    help = "boundary nodes slide on faces and edges, planar: on flat and straight ones only, or are fixed"
+    add("--boundary", choices=choices, default="slide", help=f"{help} (default: slide)")
     help = "the same for the nodes between materials (default: slide)"
     add("--interfaces", choices=choices, default="slide", help=help)
-    help = "hold straight folds shallower than this, as parts of curved faces (default: 0)"
-    add("--feature-angle", type=float, default=0.0, metavar="DEG", help=help)
+    help = "folds sharper than this are edges (default: 50; with planar 0: all straight ones)"
+    add("--feature-angle", type=float, default=None, metavar="DEG", help=help)
+    help = "distance that nodes keep to the facets of the input, over the length of edges (default: 0.01)"
+    add("--surface-tolerance", type=float, default=0.01, metavar="PART", help=help)
     help = "hold the nodes of elements stretched beyond A, a number above 1 (default: none)"
     add("--freeze-aspect", type=float, default=None, metavar="A", help=help)
     help = "hold the nodes of a named set; repeatable (default: none but those that the file marks)"
@@ -286,7 +289,7 @@ def _check_before_smoothing(options: argparse.Namespace) -> None:
 def _check_run_options(options: argparse.Namespace) -> None:
     if options.steps is not None and options.steps < 0:
         raise ValueError(f"--steps must be 0 or more, got {options.steps}")
-    if not 0 <= options.feature_angle <= 180:
+    if options.feature_angle is not None and not 0 <= options.feature_angle <= 180:
         raise ValueError(f"--feature-angle must be 0 to 180 degrees, got {options.feature_angle:g}")
     aspect = options.freeze_aspect
     if aspect is not None and not (math.isfinite(aspect) and aspect > 1):
@@ -324,14 +327,14 @@ def _method(name: str, goal: str | None) -> Method:
     return Optimize(goal=goal)
 
 
-def _run(file: MeshFile, method: Method, steps: int | None, constraints: Constraints, callback: Any):
+def _run(file: MeshFile, method: Method, steps: int | None, constraints: Motion, callback: Any):
     from jaxsmooth.runs.driver import smooth
 
     exactly = {} if steps is None else {"steps": steps, "tolerance_avg": 0.0}
     return smooth(file.mesh, method, constraints=constraints, callback=callback, **exactly)
 
 
-def _constraints(file: MeshFile, options: argparse.Namespace) -> Constraints:
+def _constraints(file: MeshFile, options: argparse.Namespace) -> Motion:
     import difflib
 
     from jaxsmooth.motion.detect import detect_constraints
@@ -352,6 +355,7 @@ def _constraints(file: MeshFile, options: argparse.Namespace) -> Constraints:
         boundary=options.boundary,
         interfaces=options.interfaces,
         feature_angle=options.feature_angle,
+        surface_tolerance=options.surface_tolerance,
         fixed=fixed,
         **frozen,
     )

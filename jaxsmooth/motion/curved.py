@@ -163,7 +163,8 @@ class Patches(Carrier):
 
     def within(self, frame: Frame) -> Patches:
         """The same in the frame."""
-        parts = frame.into(self.corners), self.bulges * frame.scale, self.reach * frame.scale
+        corners = (self.corners - frame.origin) * frame.scale
+        parts = corners, self.bulges * frame.scale, self.reach * frame.scale
         return eqx.tree_at(lambda p: (p.corners, p.bulges, p.reach), self, parts)
 
     def limited(self, move: Float[Array, "sliding dim"]) -> Float[Array, "sliding dim"]:

@@ -20,9 +20,15 @@ class Located(NamedTuple):
     home: np.ndarray
     start: np.ndarray
 
-    def select(self, mask: np.ndarray) -> Located:
-        """The nodes of a mask ``[nodes]``, each once."""
-        chosen = np.flatnonzero(mask[self.nodes])
+    def select(self, mask: np.ndarray, places: np.ndarray) -> Located:
+        """The nodes of a mask ``[nodes]``, each once, on a patch that no numbering decides.
+
+        It is the first by the coordinates of their centres, `places` ``[f, dim]``, but for rounding."""
+        size = np.abs(places).max(initial=0) or 1.0
+        rank = np.zeros(len(places), int)
+        rank[np.lexsort(np.round(places / size, 9).T)] = np.arange(len(places))
+        chosen = np.argsort(rank[self.home], kind="stable")
+        chosen = chosen[mask[self.nodes[chosen]]]
         chosen = chosen[np.unique(self.nodes[chosen], return_index=True)[1]]
         return Located(*(part[chosen] for part in self))
 
@@ -100,16 +106,16 @@ def find_curves(
     nodes, pair = two[going], pair[going]
     neighbour = np.full(len(flat), -1)
     neighbour[pair[:, 0]], neighbour[pair[:, 1]] = pair[:, 1] // 2, pair[:, 0] // 2
-    bulge = np.where(segments.bent[:, None], segments.bulge, _bulges(segments, points, tangent, known, tolerance))
+    bulge = np.where(
+        segments.bent[:, None], segments.bulge, _bulges(segments, points, tangent, known, tolerance)
+    )
     bulge[on_line & ~segments.bent] = 0
     smooth = np.zeros(count, bool)
     smooth[nodes] = True
     inner = segments.inner[segments.inner >= 0]
     smooth[inner] = ~straight[inner]
     # the side that end 0 is not on is end 1
-    layout = Layout(
-        ends, neighbour.reshape(-1, 2)[:, ::-1], points[ends], bulge[:, None], _located(segments)
-    )
+    layout = Layout(ends, neighbour.reshape(-1, 2)[:, ::-1], points[ends], bulge[:, None], _located(segments))
     return Curves(segments, bulge, layout, smooth)
 
 
@@ -148,7 +154,9 @@ def _bulges(
     along = chord / np.where(size > 0, size, 1)[:, None]
     ahead = tangent * np.array([1.0, -1.0])[:, None]  # both from the first end to the second
     mirrored = 2 * np.einsum("med,md->me", ahead, along)[..., None] * along[:, None] - ahead
-    ahead = np.where(known[..., None], ahead, np.where(known[:, ::-1, None], mirrored[:, ::-1], along[:, None]))
+    ahead = np.where(
+        known[..., None], ahead, np.where(known[:, ::-1, None], mirrored[:, ::-1], along[:, None])
+    )
     change = (ahead[:, 0] - ahead[:, 1]) / 2
     across = change - np.einsum("md,md->m", change, along)[:, None] * along
     sine = np.linalg.norm(across, axis=1)

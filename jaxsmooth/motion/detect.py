@@ -111,7 +111,7 @@ def detect_constraints(
         _add_features(mesh.labels, points, noise, flatness, normals, tangents, held)
 
     curved = "slide" in (boundary, interfaces)
-    projectors, flat = _planar(normals, tangents, 0.0 if curved else feature_angle or 0.0)
+    projectors, flat = _planar(normals, tangents, 0.0 if boundary == "slide" else feature_angle or 0.0)
     if not curved:
         projectors[held] = 0
         return Constraints(jnp.asarray(projectors, mesh.points.dtype))
@@ -123,7 +123,9 @@ def detect_constraints(
     return find_sliding(kept, angle, surface_tolerance, flatness, mesh.points.dtype)
 
 
-def _check(boundary: str, interfaces: str, layers: str, freeze_aspect: float | None, tolerance: float) -> None:
+def _check(
+    boundary: str, interfaces: str, layers: str, freeze_aspect: float | None, tolerance: float
+) -> None:
     for name, choice in (("boundary", boundary), ("interfaces", interfaces)):
         if choice not in ("slide", "planar", "fixed"):
             raise ValueError(f"{name} must be 'slide', 'planar' or 'fixed', got {choice!r}")
@@ -146,9 +148,7 @@ def _functions(surfaces: Any, sets: Mapping[str, Any], count: int) -> list[tuple
     return [(node_mask(sets[name], count), nearest) for name, nearest in surfaces.items()]
 
 
-def _planar(
-    normals: Directions, tangents: Directions, feature_angle: float
-) -> tuple[np.ndarray, np.ndarray]:
+def _planar(normals: Directions, tangents: Directions, feature_angle: float) -> tuple[np.ndarray, np.ndarray]:
     """Projectors of the planar rule ``[nodes, dim, dim]``, and the nodes whose facets lie in one plane."""
     count, dim = normals.count, normals.dim
     projectors = np.tile(np.eye(dim), (count, 1, 1))

@@ -74,12 +74,13 @@ def find_faces(
     within = (given[one] == given[two]) & (given[one] >= 0) & (edges.other >= 0)
     flat = _flat_facets(edges, angle, flat_nodes, tolerance) & (given < 0)
     either = flat[one] | flat[two]
-    apart = either & ((flat[one] != flat[two]) | (angle > _LEVEL * np.maximum(tolerance[one], tolerance[two])))
+    level = np.maximum(tolerance[one], tolerance[two])
+    apart = either & ((flat[one] != flat[two]) | (angle > _LEVEL * level))
     codes = pair_codes(edges.segments.ends, len(points))
     sure = (edges.other < 0) | (np.isinf(angle) & ~within) | (label[one] != label[two])
     sure |= (given[one] != given[two]) | np.isin(codes, pair_codes(lines, len(points)))
     sure |= apart & ~within
-    fold = np.where(sure | within, 0, angle)
+    fold = np.where(sure | within | (angle <= level), 0, angle)
     strong, weak = _folds(edges, fold, np.deg2rad(feature_angle))
     feature = _pruned(edges, sure | _chains(edges, sure, strong, weak), sure, strong, fold)
     return Faces(edges, feature, flat, given, *_vertices(edges, ~feature))
@@ -107,16 +108,18 @@ def _flat_facets(
 
 def _folds(edges: Edges, fold: np.ndarray, sharp: float) -> tuple[np.ndarray, np.ndarray]:
     """Rows whose fold is an edge by itself, and those that may continue one."""
-    # the sharpest and the second sharpest fold of every facet
-    order = np.lexsort((-fold, edges.facet))
-    starts = np.r_[0, np.flatnonzero(np.diff(edges.facet[order])) + 1]
-    first, second = np.zeros(edges.facet.max() + 1), np.zeros(edges.facet.max() + 1)
-    first[edges.facet[order[starts]]] = fold[order[starts]]
-    second[edges.facet[order[starts]]] = fold[order[starts + 1]]
-    others = np.where(fold >= first[edges.facet], second[edges.facet], first[edges.facet])
+    ends = edges.segments.ends
+    sharpest = np.zeros(int(edges.node.max()) + 1)
+    np.maximum.at(sharpest, ends, fold[:, None])
+    # at the corners of the facets on both sides that are not on the edge
+    others = np.zeros(len(fold))
+    for corner in edges.corners.T:
+        node = corner[edges.facet]
+        away = (node >= 0) & (node[:, None] != ends).all(axis=1)
+        others = np.maximum(others, np.where(away, sharpest[node], 0))
     others = np.maximum(others, np.where(edges.other >= 0, others[edges.other], 0))
     contrast = (fold > _SHALLOW) & (fold > _CONTRAST * others)
-    return (fold >= sharp) | contrast, (fold >= _WEAK * sharp) | contrast
+    return (fold > sharp) | contrast, (fold > _WEAK * sharp) | contrast
 
 
 def _chains(edges: Edges, sure: np.ndarray, strong: np.ndarray, weak: np.ndarray) -> np.ndarray:
@@ -134,9 +137,9 @@ def _chains(edges: Edges, sure: np.ndarray, strong: np.ndarray, weak: np.ndarray
 def _pruned(
     edges: Edges, feature: np.ndarray, sure: np.ndarray, strong: np.ndarray, fold: np.ndarray
 ) -> np.ndarray:
-    """Features without the least sharp side of facets that are all edges, and without short side branches."""
+    """Features without the weakest side of facets that are all edges, and without short side branches."""
     sides, count = np.bincount(edges.facet), int(edges.node.max()) + 1
-    closed = (np.bincount(edges.facet, feature) == sides)[edges.facet] & feature & ~sure
+    closed = (np.bincount(edges.facet, feature) == sides)[edges.facet] & feature & ~sure & ~strong
     least = np.full(len(sides), np.inf)
     np.minimum.at(least, edges.facet[closed], fold[closed])
     drop = closed & (fold <= least[edges.facet])

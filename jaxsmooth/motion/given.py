@@ -43,7 +43,7 @@ class Given(Carrier):
         return frame.into(self.nearest(points / frame.scale + frame.origin))
 
     def tangents(self, points: Places) -> Float[Array, "sliding dim dim"]:
-        """Projectors onto what the Jacobian keeps at the nearest points; there it is one, but for rounding."""
+        """Projectors onto what the Jacobian keeps at the nearest points, where it is one."""
         points, dim = self.foot(points), points.shape[1]
 
         def along(axis: Float[Array, " dim"]) -> Places:
@@ -75,9 +75,10 @@ def on_surface(mesh: Mesh, nodes: Any, nearest: Callable[[Any], Any]) -> Sliding
     Args:
         mesh: the mesh.
         nodes: which nodes.
-        nearest: the nearest points of the surface, ``[m, dim] -> [m, dim]``, in JAX; `host_nearest` makes one
-            of a function that is not.  Its Jacobian at the surface says what is tangent.  Where it is a pytree
-            (an `equinox.Module`, a `jax.tree_util.Partial`), runs are differentiable in its parameters.
+        nearest: the nearest points of the surface, ``[m, dim] -> [m, dim]``, in JAX; `host_nearest` makes
+            one of a function that is not.  Its Jacobian at the surface says what is tangent.  Where it
+            is a pytree (an `equinox.Module`, a `jax.tree_util.Partial`), runs are differentiable in its
+            parameters.
     """
     count = len(mesh.points)
     eye = jnp.broadcast_to(jnp.eye(mesh.dim, dtype=mesh.points.dtype), (count, mesh.dim, mesh.dim))
@@ -123,6 +124,8 @@ def _on_host_jvp(function, step, primals, tangents):
     total = jnp.zeros_like(points)
     for i, axis in enumerate(np.eye(points.shape[1]) * step):
         shift = jnp.asarray(axis, points.dtype)
-        slope = (_on_host(function, step, points + shift) - _on_host(function, step, points - shift)) / (2 * step)
+        slope = (_on_host(function, step, points + shift) - _on_host(function, step, points - shift)) / (
+            2 * step
+        )
         total = total + slope * change[:, i : i + 1]
     return _on_host(function, step, points), total

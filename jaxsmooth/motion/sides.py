@@ -176,6 +176,14 @@ class Edges:
         return cls(segments, *joined, other, same)
 
     @property
+    def corners(self) -> np.ndarray:
+        """Corner nodes of every facet ``[facets, 4]``; −1 where there are fewer."""
+        order = np.arange(len(self.of)) - np.searchsorted(self.of, self.of)
+        found = np.full((int(self.of.max()) + 1, 4), -1)
+        found[self.of, order] = self.node
+        return found
+
+    @property
     def angle(self) -> np.ndarray:
         """Angle of the fold at each row ``[rows]``; infinite where the facets do not continue each other."""
         other = np.maximum(self.other, 0)

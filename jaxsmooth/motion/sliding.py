@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsmooth.mesh.topology import lengths
+from jaxsmooth.mesh.topology import lengths, pair_codes
 from jaxsmooth.motion.curved import Carrier, Patches, Sliding
 from jaxsmooth.motion.curves import Curves, Layout, find_curves
 from jaxsmooth.motion.directions import Noise, facet_normals
 from jaxsmooth.motion.features import Faces, find_faces
 from jaxsmooth.motion.given import given
 from jaxsmooth.motion.planar import Constraints
-from jaxsmooth.motion.sides import Segments, Sides, pair_codes
+from jaxsmooth.motion.sides import Segments, Sides, segments_of
 from jaxsmooth.motion.surfaces import build_surfaces
 
 __all__ = ["Kept", "find_sliding"]
@@ -68,14 +68,18 @@ def find_sliding(
     quads = any(part.type.linear and part.type.corners == 4 for part in kept.sides)
     share = (0.5 if quads else 0.75) if dim == 3 else 1.0  # bulges of the edges of a facet add up inside
     faces = None
+    known = [facet_normals(p.type, points[p.nodes], kept.noise.at(p.nodes), flatness) for p in kept.sides]
+    bound = kept.bound.copy()
+    for part, normals in zip(kept.sides, known, strict=True):
+        bound[part.nodes[~normals.known]] = True  # those of facets without a normal
+    kept = replace(kept, bound=bound)
     if dim == 3 and kept.sides:
-        known = [facet_normals(p.type, points[p.nodes], kept.noise.at(p.nodes), flatness) for p in kept.sides]
         lines = np.concatenate([np.zeros((0, 2), int), *(part.ends for part in kept.lines)])
         precise = np.concatenate([part.tolerance for part in known])
         faces = find_faces(kept.sides, points, kept.flat, precise, lines, feature_angle)
         parts = [faces.edges.segments.select(faces.feature), *kept.lines]
     elif dim == 2:
-        parts = [*(segments for segments, _ in _plane_segments(kept)), *kept.lines]
+        parts = [*(segments_of(p.type, p.nodes, points) for p in kept.sides), *kept.lines]
     else:
         parts = list(kept.lines)
     if not sum(len(part.ends) for part in parts):
@@ -86,13 +90,6 @@ def find_sliding(
         curves = find_curves(segments, points, straight, feature_angle, tolerance * share)
     roles = _roles(kept, faces, curves, straight, on_line)
     return _motion(kept, faces, curves, roles, (feature_angle, tolerance * share), dtype)
-
-
-def _plane_segments(kept: Kept) -> list[tuple[Segments, np.ndarray]]:
-    """The facets of a plane mesh, and the given curve that each lies on."""
-    from jaxsmooth.motion.sides import segments_of
-
-    return [(segments_of(p.type, p.nodes, kept.points), p.given) for p in kept.sides]
 
 
 def _straight(kept: Kept, segments: Segments) -> tuple[np.ndarray, np.ndarray]:
@@ -131,10 +128,7 @@ def _roles(
     count = len(kept.points)
     none = np.zeros(count, bool)
     free = ~kept.held & ~kept.bound
-    if curves is not None:
-        free_along = curves.smooth & ~straight & free
-    else:
-        free_along = none
+    free_along = none if curves is None else curves.smooth & ~straight & free
     touched, curved, beside, fans = none.copy(), none.copy(), none.copy(), none.copy()
     whose = [none.copy() for _ in kept.surfaces]
     facet = 0
@@ -181,11 +175,11 @@ def _motion(
     if curves is not None and roles.along.any():
         carriers.append(_patches(curves.layout, roles.along, _reach(points, curves.segments.ends), dtype))
     if faces is not None and roles.on.any():
-        ends = pair_codes(np.zeros((0, 2), int), 1), np.zeros((0, 3))
+        rims = np.zeros(0, int), np.zeros((0, 3))
         if curves is not None:
-            ends = pair_codes(curves.segments.ends, len(points)), curves.bulge
+            rims = pair_codes(curves.segments.ends, len(points)), curves.bulge
         angle, bound = bounds
-        layout = build_surfaces(kept.sides, faces, points, ends, bound, np.deg2rad(angle))
+        layout = build_surfaces(kept.sides, faces, points, rims, bound, np.deg2rad(angle))
         carriers.append(_patches(layout, roles.on, _reach(points, faces.edges.segments.ends), dtype))
     for mask, (_, nearest) in zip(roles.given, kept.surfaces, strict=True):
         if mask.any():
@@ -206,9 +200,13 @@ def _reach(points: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 
 def _patches(layout: Layout, mask: np.ndarray, reach: np.ndarray, dtype: Any) -> Patches:
-    located = layout.located.select(mask)
-    whole = (jnp.asarray(a, jnp.int32) for a in (located.nodes, located.home, layout.vertices, layout.neighbours))
-    real = (jnp.asarray(a, dtype) for a in (located.start, reach[located.nodes], layout.corners, layout.bulges))
-    nodes, home, vertices, neighbours = whole
-    start, longest, corners, bulges = real
+    located = layout.located.select(mask, layout.corners.mean(axis=1))
+    start, longest, corners, bulges = (
+        jnp.asarray(part, dtype)
+        for part in (located.start, reach[located.nodes], layout.corners, layout.bulges)
+    )
+    nodes, home, vertices, neighbours = (
+        jnp.asarray(part, jnp.int32)
+        for part in (located.nodes, located.home, layout.vertices, layout.neighbours)
+    )
     return Patches(nodes, home, start, longest, vertices, neighbours, corners, bulges)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 
 from jaxsmooth.cells.table import ElementType, element_type
-from jaxsmooth.mesh.topology import lengths, pair_codes
+from jaxsmooth.mesh.topology import pair_codes
 from jaxsmooth.motion.curves import Layout, Located, arc_bulge
 from jaxsmooth.motion.features import Faces
 from jaxsmooth.motion.sides import Sides
@@ -84,9 +84,11 @@ def _patches(
     ends = natural[local]  # [t, 3, 2]
     middle = (np.roll(ends, -1, axis=1) + np.roll(ends, -2, axis=1)) / 2
     many = len(local)
-    at = np.einsum("tck,mkd->mtcd", kind.shape_functions(ends.reshape(-1, 2)).reshape(many, 3, -1), places)
+    at = np.einsum(
+        "tck,mkd->mtcd", kind.shape_functions(ends.reshape(-1, 2)).reshape(many, 3, kind.k), places
+    )
     half = np.einsum(
-        "tck,mkd->mtcd", kind.shape_functions(middle.reshape(-1, 2)).reshape(many, 3, -1), places
+        "tck,mkd->mtcd", kind.shape_functions(middle.reshape(-1, 2)).reshape(many, 3, kind.k), places
     )
     bulge = half - (np.roll(at, -1, axis=2) + np.roll(at, -2, axis=2)) / 2
     # where the nodes of a facet lie
@@ -101,7 +103,7 @@ def _patches(
     )
     flat = len(nodes) * many
     vertices = corner[:, local].reshape(flat, 3)
-    return Layout(vertices, vertices, at.reshape(flat, 3, -1), bulge.reshape(flat, 3, -1), located)
+    return Layout(vertices, vertices, at.reshape(flat, 3, 3), bulge.reshape(flat, 3, 3), located)
 
 
 def _joined(parts: list[Layout], faces: Faces, count: int, vertices: int) -> Layout:
@@ -231,9 +233,3 @@ def _fitted_normals(pairs: np.ndarray, place: np.ndarray, first: np.ndarray) -> 
     found /= np.maximum(np.linalg.norm(found, axis=1), 1e-30)[:, None]
     near = np.einsum("vd,vd->v", found, first) > np.cos(_FAR)
     return np.where((sound & near)[:, None], found, first)
-
-
-def edge_lengths(points: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Mean length of the edges at each node ``[nodes]``; 0 where there are none."""
-    total = np.bincount(pairs.reshape(-1), np.repeat(lengths(points, pairs), 2), len(points))
-    return total / np.maximum(np.bincount(pairs.reshape(-1), minlength=len(points)), 1)

@@ -22,9 +22,11 @@ from jaxsmooth.convert.meshfile import MeshFile
 from jaxsmooth.files.outputs import Outputs
 from jaxsmooth.guards.acceptance import POOR
 from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.mesh.topology import signed_measures
 from jaxsmooth.metrics.table import METRICS, quality
 from jaxsmooth.metrics.validity import inverted
 from jaxsmooth.motion.base import Motion
+from jaxsmooth.motion.curved import Sliding
 from jaxsmooth.runs.driver import SmoothResult, StepRecord
 
 __all__ = [
@@ -245,6 +247,9 @@ def print_constraints(out: Console, constraints: Motion, mesh: Mesh) -> None:
     names = (*names[:dim], names[-1])
     parts = [f"{(freedom == value).sum():,} {name}" for value, name in enumerate(names)]
     out.print(f"nodes: {', '.join(parts)}")
+    if isinstance(constraints, Sliding):
+        parts = [f"{number:,} {where}" for where, number in constraints.counts.items()]
+        out.print(f"of those that slide: {', '.join(parts)}")
 
 
 def print_step(out: Console, row: StepRecord) -> None:
@@ -285,6 +290,15 @@ def print_comparison(out: Console, before: Mesh, result: SmoothResult) -> None:
     for row in comparison(before, result):
         table.add_row(*row)
     out.print(table)
+    if isinstance(result.constraints, Sliding):
+        first, last = (
+            sum(
+                signed_measures(kind, np.asarray(m.points), np.asarray(nodes)).sum()
+                for kind, nodes in m.blocks
+            )
+            for m in (before, result.mesh)
+        )
+        out.print(f"{'area' if before.dim == 2 else 'volume'} changed by {(last - first) / first:+.2e}")
 
 
 def print_quality(out: Console, rows: list[dict[str, Any]]) -> None:

@@ -54,18 +54,21 @@ def stack(meshes: Sequence[Any], constraints: Sequence[Constraints] | None = Non
 
     Args:
         meshes: each a `Mesh` or whatever else `as_mesh` takes; their blocks may differ in size and type.
-        constraints: theirs; detected by default.
+        constraints: theirs; by default those of flat faces and straight edges (``boundary="planar"``).
 
     Returns:
         The batch.
 
     Raises:
-        ValueError: for no meshes, or meshes of different dimensions.
+        ValueError: for no meshes, meshes of different dimensions, or motions on curved surfaces.
     """
     meshes = [as_mesh(mesh) for mesh in meshes]
     if not meshes or len({mesh.dim for mesh in meshes}) > 1:
         raise ValueError("stack needs meshes of one dimension, at least one")
-    constraints = [detect_constraints(m) for m in meshes] if constraints is None else constraints
+    if constraints is None:
+        constraints = [detect_constraints(m, boundary="planar", interfaces="planar") for m in meshes]
+    if any(not isinstance(held, Constraints) for held in constraints):
+        raise ValueError("stack takes constant constraints only; detect them with boundary='planar'")
     types = sorted({name for mesh in meshes for name in mesh.types})
     kinds = [element_type(name) for name in types]
     joined = [{name: [] for name in types} for _ in meshes]
