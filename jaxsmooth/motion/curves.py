@@ -32,6 +32,10 @@ class Located(NamedTuple):
         chosen = chosen[np.unique(self.nodes[chosen], return_index=True)[1]]
         return Located(*(part[chosen] for part in self))
 
+    def without(self, mask: np.ndarray) -> Located:
+        """All but the nodes of a mask ``[nodes]``."""
+        return Located(*(part[~mask[self.nodes]] for part in self))
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -50,6 +54,18 @@ class Layout:
     corners: np.ndarray
     bulges: np.ndarray
     located: Located
+
+    def tangents(self, located: Located) -> np.ndarray:
+        """Projectors onto the tangents at nodes ``[s, dim, dim]``."""
+        corners, bulges, at = self.corners[located.home], self.bulges[located.home], located.start
+        slope = corners.copy()
+        if at.shape[1] == 2:
+            slope += 4 * at[:, ::-1, None] * bulges
+        for i in range(3 if at.shape[1] == 3 else 0):  # edge i joins vertices i − 1 and i − 2
+            slope[:, i - 1] += 4 * at[:, i - 2, None] * bulges[:, i]
+            slope[:, i - 2] += 4 * at[:, i - 1, None] * bulges[:, i]
+        frame = np.swapaxes(slope[:, 1:] - slope[:, :1], 1, 2)
+        return frame @ np.linalg.pinv(frame)
 
 
 @dataclass(frozen=True)

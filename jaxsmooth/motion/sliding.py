@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxsmooth.mesh.topology import lengths, pair_codes
 from jaxsmooth.motion.curved import Carrier, Patches, Sliding
-from jaxsmooth.motion.curves import Curves, Layout, find_curves
+from jaxsmooth.motion.curves import Curves, Layout, Located, find_curves
 from jaxsmooth.motion.directions import Noise, facet_normals
 from jaxsmooth.motion.features import Faces, find_faces
 from jaxsmooth.motion.given import given
@@ -22,6 +22,7 @@ from jaxsmooth.motion.surfaces import build_surfaces
 __all__ = ["Kept", "find_sliding"]
 
 _REACH = 4.0  # edges that a node may move in a step
+_RIGID = 1e-4  # mean square of what a rigid motion of size 1 has across the surface
 _ALONG = np.cos(0.05)  # an edge that is off a straight line by more is not on it
 
 
@@ -171,24 +172,73 @@ def _motion(
     dtype: Any,
 ) -> Constraints | Sliding:
     points, dim = kept.points, kept.points.shape[1]
-    carriers: list[Carrier] = []
+    projectors = kept.projectors.copy()
+    projectors[roles.lost | kept.held] = 0
+    projectors[roles.along | roles.on | roles.alone] = np.eye(dim)
+    layouts: list[tuple[Layout, Located, np.ndarray]] = []
     if curves is not None and roles.along.any():
-        carriers.append(_patches(curves.layout, roles.along, _reach(points, curves.segments.ends), dtype))
+        located = curves.layout.located.select(roles.along, curves.layout.corners.mean(axis=1))
+        layouts.append((curves.layout, located, curves.segments.ends))
     if faces is not None and roles.on.any():
         rims = np.zeros(0, int), np.zeros((0, 3))
         if curves is not None:
             rims = pair_codes(curves.segments.ends, len(points)), curves.bulge
         angle, bound = bounds
         layout = build_surfaces(kept.sides, faces, points, rims, bound, np.deg2rad(angle))
-        carriers.append(_patches(layout, roles.on, _reach(points, faces.edges.segments.ends), dtype))
-    for mask, (_, nearest) in zip(roles.given, kept.surfaces, strict=True):
-        if mask.any():
-            carriers.append(given(np.flatnonzero(mask), nearest))
-    projectors = kept.projectors.copy()
-    projectors[roles.lost | kept.held] = 0
-    projectors[roles.along | roles.on | roles.alone] = np.eye(dim)
-    projectors = jnp.asarray(projectors, dtype)
-    return Sliding(projectors, tuple(carriers)) if carriers else Constraints(projectors)
+        located = layout.located.select(roles.on, layout.corners.mean(axis=1))
+        layouts.append((layout, located, faces.edges.segments.ends))
+    surfaces = [
+        given(np.flatnonzero(mask), nearest)
+        for mask, (_, nearest) in zip(roles.given, kept.surfaces, strict=True)
+        if mask.any()
+    ]
+    if not layouts and not surfaces:
+        return Constraints(jnp.asarray(projectors, dtype))
+    tangents = projectors.copy()
+    for layout, located, _ in layouts:
+        tangents[located.nodes] = layout.tangents(located)
+    for carrier in surfaces:
+        nodes = np.asarray(carrier.nodes)
+        only = nodes[roles.alone[nodes]]
+        tangents[only] = np.asarray(carrier.tangents(jnp.asarray(points[nodes], dtype)))[roles.alone[nodes]]
+    stays = np.zeros(len(points), bool)
+    stays[anchors(points, tangents)] = True
+    projectors[stays] = 0
+    carriers: list[Carrier] = [
+        _patches(layout, located.without(stays), _reach(points, pairs), dtype)
+        for layout, located, pairs in layouts
+    ]
+    for carrier in surfaces:
+        nodes = np.asarray(carrier.nodes)
+        carriers.append(given(nodes[~stays[nodes]], carrier.nearest))
+    return Sliding(jnp.asarray(projectors, dtype), tuple(carriers))
+
+
+def anchors(points: np.ndarray, projectors: np.ndarray) -> list[int]:
+    """Nodes to hold, one for each rigid motion that the boundary would allow.
+
+    A ball may turn within its own surface: elasticity has nothing against it, and nothing says how far.
+    """
+    count, dim = points.shape
+    away = points - points.mean(axis=0)
+    away = away / max(np.abs(away).max(), np.finfo(float).tiny)
+    pairs = [(0, 1)] if dim == 2 else [(1, 2), (2, 0), (0, 1)]
+    rigid = np.zeros((count, dim, dim + len(pairs)))
+    rigid[:, np.arange(dim), np.arange(dim)] = 1
+    for mode, (i, j) in enumerate(pairs):
+        rigid[:, i, dim + mode], rigid[:, j, dim + mode] = -away[:, j], away[:, i]
+    rest = np.einsum("nij,njm->nim", np.eye(dim) - projectors, rigid)
+    bound = (np.abs(projectors - np.eye(dim)) > 1e-9).any(axis=(1, 2))
+    held: list[int] = []
+    for _ in range(dim + len(pairs)):
+        matrix = np.einsum("nim,nik->mk", rest, rest) / max(bound.sum(), 1)
+        value, vector = np.linalg.eigh(matrix)
+        if value[0] > _RIGID or not bound.any():
+            break
+        size = np.linalg.norm(np.einsum("nim,m->ni", rigid, vector[:, 0]), axis=1)
+        held.append(int(np.argmax(np.round(np.where(bound, size, 0), 6))))
+        rest[held[-1]] = rigid[held[-1]] * np.sqrt(bound.sum())
+    return held
 
 
 def _reach(points: np.ndarray, pairs: np.ndarray) -> np.ndarray:
@@ -199,8 +249,7 @@ def _reach(points: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     return _REACH * np.where(number > 0, total / np.maximum(number, 1), mean)
 
 
-def _patches(layout: Layout, mask: np.ndarray, reach: np.ndarray, dtype: Any) -> Patches:
-    located = layout.located.select(mask, layout.corners.mean(axis=1))
+def _patches(layout: Layout, located: Located, reach: np.ndarray, dtype: Any) -> Patches:
     start, longest, corners, bulges = (
         jnp.asarray(part, dtype)
         for part in (located.start, reach[located.nodes], layout.corners, layout.bulges)
