@@ -11,8 +11,9 @@ import numpy as np
 from jaxsmooth.cells.table import ElementType, element_type
 from jaxsmooth.convert.meshfile import as_mesh
 from jaxsmooth.mesh.layers import layer_nodes, nodes_of, stretched
-from jaxsmooth.mesh.record import Labels
+from jaxsmooth.mesh.record import Labels, Mesh
 from jaxsmooth.mesh.topology import facet_keys, find_facets
+from jaxsmooth.metrics.summary import evaluated
 from jaxsmooth.motion.curved import Sliding
 from jaxsmooth.motion.directions import Directions, Noise, facet_normals, unit_tangents
 from jaxsmooth.motion.features import FEATURE_ANGLE
@@ -115,6 +116,7 @@ def detect_constraints(
     if not curved:
         projectors[held] = 0
         return Constraints(jnp.asarray(projectors, mesh.points.dtype))
+    bound |= _tangled(mesh)
     tagged, tags, lines = _tagged(mesh.labels, points)
     masks = [mask for mask, _ in functions]
     sides = unique_sides([*parts, *tagged], tags, masks, count)
@@ -135,6 +137,21 @@ def _check(
         raise ValueError(f"freeze_aspect must be 1 or more, got {freeze_aspect}")
     if not 0 <= tolerance <= 1:
         raise ValueError(f"surface_tolerance must be 0 to 1, got {tolerance}")
+
+
+def _tangled(mesh: Mesh) -> np.ndarray:
+    """Nodes of inverted elements with mid-side nodes ``[nodes]``.
+
+    Moves of corners and mid-side nodes along the surface get into each other's way there: interior nodes
+    alone untangle more.
+    """
+    found = np.zeros(len(mesh.points), bool)
+    if all(kind.linear for kind, _ in mesh.blocks):
+        return found
+    for (kind, nodes), det in zip(mesh.blocks, evaluated(mesh.bare).jacobian, strict=True):
+        if not kind.linear:
+            found[np.asarray(nodes)[~(np.asarray(det) > 0)]] = True
+    return found
 
 
 def _functions(surfaces: Any, sets: Mapping[str, Any], count: int) -> list[tuple[np.ndarray, Nearest]]:
