@@ -134,6 +134,7 @@ class Patches(Carrier):
         neighbours: the patch behind the side that vertex i is not on; −1 where the face ends.
         corners: x.
         bulges: b.
+        directions: unit tangents of a curve, or normals of a surface, at the vertices.
     """
 
     nodes: Int[Array, " sliding"]
@@ -144,6 +145,7 @@ class Patches(Carrier):
     neighbours: Int[Array, "patches v"]
     corners: Float[Array, "patches v dim"]
     bulges: Float[Array, "patches _ dim"]
+    directions: Float[Array, "patches v dim"]
     tethered: ClassVar[bool] = True
 
     @property
@@ -156,10 +158,11 @@ class Patches(Carrier):
         return _feet(self, points)[0]
 
     def tangents(self, points: Float[Array, "sliding dim"]) -> Float[Array, "sliding dim dim"]:
-        """Projectors onto the tangents at the nearest points."""
-        frames = _feet(self, points)[1]
-        inverse = _inverse(jnp.swapaxes(frames, -1, -2) @ frames)
-        return frames @ inverse @ jnp.swapaxes(frames, -1, -2)
+        """Projectors onto the tangents at the nearest points; they do not jump between patches."""
+        along = _feet(self, points)[1]
+        square = along[:, :, None] * along[:, None]
+        square = square / (along**2).sum(axis=-1)[:, None, None]
+        return square if self.dim == 1 else jnp.eye(points.shape[1], dtype=points.dtype) - square
 
     def within(self, frame: Frame) -> Patches:
         """The same in the frame."""
@@ -178,13 +181,12 @@ class Patches(Carrier):
 @jax.jit
 def _feet(
     patches: Patches, points: Float[Array, "sliding dim"]
-) -> tuple[Float[Array, "sliding dim"], Float[Array, "sliding dim p"]]:
-    """The nearest points, and the tangents there as columns."""
+) -> tuple[Float[Array, "sliding dim"], Float[Array, "sliding dim"]]:
+    """The nearest points, and the directions there."""
     fixed = jax.lax.stop_gradient(patches)
     walk = jax.vmap(lambda x, home, start: _walk(fixed, x, home, start))
     places = walk(jax.lax.stop_gradient(points), fixed.home, fixed.start)
-    there = jax.vmap(lambda x, place: _there(patches, x, place))(points, places)
-    return there.point, there.frame
+    return jax.vmap(lambda x, place: _there(patches, x, place))(points, places)
 
 
 class _Place(NamedTuple):
@@ -224,14 +226,18 @@ def _geometry(patches: Patches, patch: Int[Array, ""], weights: Float[Array, " v
     return _Geometry(point, (slope[1:] - slope[0]).T, jnp.moveaxis(across[:, 1:] - across[:, :1], -1, 0))
 
 
-def _there(patches: Patches, x: Float[Array, " dim"], place: _Place) -> _Geometry:
-    """The geometry at the nearest point of a known place, with the derivative of the nearest point."""
+def _there(
+    patches: Patches, x: Float[Array, " dim"], place: _Place
+) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+    """The nearest point at a known place, and the direction there, with their derivatives."""
     fixed, frozen = jax.lax.stop_gradient((patches, place))
     inverse = jax.lax.stop_gradient(_newton(fixed, jax.lax.stop_gradient(x), frozen)[1])
     here = jax.lax.stop_gradient(_geometry(fixed, frozen.patch, frozen.weights))
     step = inverse @ (here.frame.T @ (x - here.point))
     step = step - jax.lax.stop_gradient(step)  # the walk has come to its end: only the derivative counts
-    return _geometry(patches, frozen.patch, frozen.weights + jnp.append(-step.sum(), step))
+    weights = frozen.weights + jnp.append(-step.sum(), step)
+    along = (weights[:, None] * patches.directions[frozen.patch]).sum(axis=0)
+    return _geometry(patches, frozen.patch, weights).point, along
 
 
 def _newton(
@@ -299,7 +305,8 @@ def _walk(
         step, _ = _newton(patches, x, place)
         part = jnp.where(step < 0, place.weights / jnp.where(step < 0, -step, 1), jnp.inf)
         side = jnp.argmin(part)
-        leaves = part[side] < 1
+        there = jnp.abs(step).max() <= tolerance  # then rounding shall not lead to another patch
+        leaves = (part[side] < 1) & ~there
         weights = place.weights + jnp.minimum(part[side], 1) * step
         weights = jnp.where(leaves & (sides == side), 0, jnp.maximum(weights, 0))
         weights = weights / weights.sum()
@@ -308,11 +315,10 @@ def _walk(
         crosses = leaves & (other >= 0) & ~(back & (place.turns >= _TURNS))
         patch = jnp.where(crosses, other, place.patch)
         same = patches.vertices[patch][:, None] == patches.vertices[place.patch]
-        there = jnp.where(crosses, (same * weights).sum(axis=1), weights)
+        taken = jnp.where(crosses, (same * weights).sum(axis=1), weights)
         turns = jnp.where(crosses, jnp.where(back, place.turns + 1, 0), place.turns)
         entry = jnp.where(crosses, jnp.argmin(same.any(axis=1)).astype(jnp.int32), place.entry)
-        done = ~crosses & (jnp.abs(step).max() <= tolerance)
-        return _Place(patch, there, entry, turns, place.count + 1, done)
+        return _Place(patch, taken, entry, turns, place.count + 1, there)
 
     zero = jnp.int32(0)
     first = _Place(home, start, jnp.int32(-1), zero, zero, jnp.bool_(False))

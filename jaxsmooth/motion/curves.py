@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,8 @@ from jaxsmooth.mesh.topology import lengths
 from jaxsmooth.motion.sides import Segments
 
 __all__ = ["Curves", "Layout", "Located", "arc_bulge", "find_curves"]
+
+_TINY = np.finfo(float).tiny
 
 
 class Located(NamedTuple):
@@ -55,17 +58,58 @@ class Layout:
     bulges: np.ndarray
     located: Located
 
+    @cached_property
+    def directions(self) -> np.ndarray:
+        """Unit tangents of a curve, or normals of a surface, at the vertices ``[f, p + 1, dim]``.
+
+        Means over the patches at a vertex, by their angles there: they do not jump where patches meet.
+        """
+        many = self.vertices.shape[1]
+        slopes = np.repeat(self.corners[:, None], many, axis=1)  # at each vertex, by each weight
+        for i in range(many):
+            for k in range(many):
+                if i != k:
+                    slopes[:, i, k] += 4 * self.bulges[:, 0 if many == 2 else 3 - i - k]
+        frame = slopes[:, :, 1:] - slopes[:, :, :1]
+        if many == 2:
+            found = frame[:, :, 0] / np.maximum(np.linalg.norm(frame[:, :, 0], axis=-1), _TINY)[..., None]
+            # curves may run either way on both sides of a vertex
+            sign = np.array([1.0, -1.0])[:, None]
+            return found if len(found) == 0 else _aligned(found, self, sign)
+        found = np.cross(frame[:, :, 0], frame[:, :, 1])
+        found /= np.maximum(np.linalg.norm(found, axis=-1), _TINY)[..., None]
+        one = np.roll(self.corners, -1, axis=1) - self.corners
+        two = np.roll(self.corners, -2, axis=1) - self.corners
+        sine = np.linalg.norm(np.cross(one, two), axis=-1)
+        angle = np.arctan2(sine, (one * two).sum(axis=-1))
+        total = np.zeros((int(self.vertices.max(initial=-1)) + 1, 3))
+        np.add.at(total, self.vertices, found * angle[..., None])
+        size = np.linalg.norm(total, axis=1, keepdims=True)
+        return (total / np.where(size > 0, size, 1))[self.vertices]
+
     def tangents(self, located: Located) -> np.ndarray:
         """Projectors onto the tangents at nodes ``[s, dim, dim]``."""
-        corners, bulges, at = self.corners[located.home], self.bulges[located.home], located.start
-        slope = corners.copy()
-        if at.shape[1] == 2:
-            slope += 4 * at[:, ::-1, None] * bulges
-        for i in range(3 if at.shape[1] == 3 else 0):  # edge i joins vertices i − 1 and i − 2
-            slope[:, i - 1] += 4 * at[:, i - 2, None] * bulges[:, i]
-            slope[:, i - 2] += 4 * at[:, i - 1, None] * bulges[:, i]
-        frame = np.swapaxes(slope[:, 1:] - slope[:, :1], 1, 2)
-        return frame @ np.linalg.pinv(frame)
+        along = (self.directions[located.home] * located.start[..., None]).sum(axis=1)
+        square = np.einsum("si,sj->sij", along, along)
+        square = square / np.maximum((along**2).sum(axis=1), _TINY)[:, None, None]
+        return square if self.vertices.shape[1] == 2 else np.eye(along.shape[1]) - square
+
+
+def _aligned(found: np.ndarray, layout: Layout, sign: np.ndarray) -> np.ndarray:
+    """Mean tangents ``[f, 2, dim]``: at each end of a segment that with the next one's, if there is one."""
+    mean = found.copy()
+    for end in range(2):
+        other = layout.neighbours[:, 1 - end]  # behind the side that the other vertex is not on
+        near = np.maximum(other, 0)
+        same = layout.vertices[near] == layout.vertices[:, end : end + 1]
+        its = np.where(same[:, :1], found[near, 0] * sign[0], found[near, 1] * sign[1])
+        into = found[:, end] * sign[end]  # both leave the vertex
+        long = np.linalg.norm(layout.corners[:, 1] - layout.corners[:, 0], axis=1)
+        joint = (into * long[near][:, None] - its * long[:, None]) * sign[end]
+        size = np.linalg.norm(joint, axis=1, keepdims=True)
+        chosen = (other >= 0)[:, None] & (size > 0)
+        mean[:, end] = np.where(chosen, joint / np.where(size > 0, size, 1), found[:, end])
+    return mean
 
 
 @dataclass(frozen=True)

@@ -235,8 +235,10 @@ def anchors(points: np.ndarray, projectors: np.ndarray) -> list[int]:
         value, vector = np.linalg.eigh(matrix)
         if value[0] > _RIGID or not bound.any():
             break
-        size = np.linalg.norm(np.einsum("nim,m->ni", rigid, vector[:, 0]), axis=1)
-        held.append(int(np.argmax(np.round(np.where(bound, size, 0), 6))))
+        loose = vector[:, value <= _RIGID]  # all of them: which is the first is chance
+        size = np.where(bound, np.linalg.norm(np.einsum("nim,mk->nik", rigid, loose), axis=(1, 2)), 0)
+        most = np.flatnonzero(size > size.max() - 1e-6)
+        held.append(int(most[np.lexsort(np.round(away[most], 6).T)[0]]))
         rest[held[-1]] = rigid[held[-1]] * np.sqrt(bound.sum())
     return held
 
@@ -250,12 +252,18 @@ def _reach(points: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 
 def _patches(layout: Layout, located: Located, reach: np.ndarray, dtype: Any) -> Patches:
-    start, longest, corners, bulges = (
+    start, longest, *shape = (
         jnp.asarray(part, dtype)
-        for part in (located.start, reach[located.nodes], layout.corners, layout.bulges)
+        for part in (
+            located.start,
+            reach[located.nodes],
+            layout.corners,
+            layout.bulges,
+            layout.directions,
+        )
     )
     nodes, home, vertices, neighbours = (
         jnp.asarray(part, jnp.int32)
         for part in (located.nodes, located.home, layout.vertices, layout.neighbours)
     )
-    return Patches(nodes, home, start, longest, vertices, neighbours, corners, bulges)
+    return Patches(nodes, home, start, longest, vertices, neighbours, *shape)
