@@ -36,7 +36,9 @@ _HOMES = {
     "metrics.table": ("METRICS", "quality", "quality_mean"),
     "motion.base": ("Motion",),
     "motion.coupled": ("Coupled", "couple"),
+    "motion.curved": ("Sliding",),
     "motion.detect": ("detect_constraints",),
+    "motion.given": ("host_nearest", "on_surface"),
     "motion.planar": ("Constraints",),
     "runs.batch": ("Batch", "stack"),
     "runs.driver": ("SmoothResult", "smooth"),
@@ -72,6 +74,7 @@ __all__ = [
     "OwnSize",
     "PatchGuard",
     "Run",
+    "Sliding",
     "SmoothResult",
     "Stage",
     "Statistics",
@@ -86,7 +89,9 @@ __all__ = [
     "find_periodic",
     "fixed_point",
     "from_meshio",
+    "host_nearest",
     "keep_compiled",
+    "on_surface",
     "quality",
     "quality_mean",
     "read",
@@ -121,7 +126,9 @@ if TYPE_CHECKING:
     from jaxsmooth.metrics.table import METRICS, quality, quality_mean
     from jaxsmooth.motion.base import Motion
     from jaxsmooth.motion.coupled import Coupled, couple
+    from jaxsmooth.motion.curved import Sliding
     from jaxsmooth.motion.detect import detect_constraints
+    from jaxsmooth.motion.given import host_nearest, on_surface
     from jaxsmooth.motion.planar import Constraints
     from jaxsmooth.runs.batch import Batch, stack
     from jaxsmooth.runs.driver import SmoothResult, smooth

@@ -226,7 +226,7 @@ def _check_before_smoothing(options: argparse.Namespace) -> None:
 def _check_run_options(options: argparse.Namespace) -> None:
     if options.steps is not None and options.steps < 0:
         raise ValueError(f"--steps must be 0 or more, got {options.steps}")
-    if not 0 <= options.feature_angle <= 180:
+    if options.feature_angle is not None and not 0 <= options.feature_angle <= 180:
         raise ValueError(f"--feature-angle must be 0 to 180 degrees, got {options.feature_angle:g}")
     aspect = options.freeze_aspect
     if aspect is not None and not (math.isfinite(aspect) and aspect > 1):
@@ -296,6 +296,7 @@ def _constraints(file: MeshFile, options: argparse.Namespace) -> Motion:
         boundary=options.boundary,
         interfaces=options.interfaces,
         feature_angle=options.feature_angle,
+        surface_tolerance=options.surface_tolerance,
         fixed=fixed,
         **frozen,
     )

@@ -70,7 +70,7 @@ def parser(runs: Mapping[str, Callable[..., int]]) -> argparse.ArgumentParser:
 def _add_precision(command: argparse.ArgumentParser) -> None:
     help = "of the computation (default: float64)"
     command.add_argument("--precision", choices=("float64", "float32"), default="float64", help=help)
-    help = "compile anew: by default compiled programs are kept for the next run, in the user's cache folder"
+    help = "compile anew, and keep nothing (default: compiled programs are kept in the user's cache folder)"
     command.add_argument("--no-cache", action="store_true", help=help)
 
 
@@ -83,13 +83,15 @@ def _add_run_options(command: argparse.ArgumentParser) -> None:
     add("--steps", type=int, default=None, metavar="N", help=help)
     help = f"of the method optimize: one of {', '.join(GOALS)} (default: balanced)"
     add("--goal", choices=GOALS, default=None, metavar="NAME", help=help)
-    choices = ("slide", "fixed")
-    help = "what boundary nodes do: slide on flat faces and straight edges, or fixed (default: slide)"
-    add("--boundary", choices=choices, default="slide", help=help)
+    choices = ("slide", "planar", "fixed")
+    help = "boundary nodes slide on faces and edges, planar: on flat and straight ones only, or are fixed"
+    add("--boundary", choices=choices, default="slide", help=f"{help} (default: slide)")
     help = "the same for the nodes between materials (default: slide)"
     add("--interfaces", choices=choices, default="slide", help=help)
-    help = "hold straight folds shallower than this, as parts of curved faces (default: 0)"
-    add("--feature-angle", type=float, default=0.0, metavar="DEG", help=help)
+    help = "folds sharper than this are edges (default: 50; with planar 0: all straight ones)"
+    add("--feature-angle", type=float, default=None, metavar="DEG", help=help)
+    help = "distance that nodes keep to the facets of the input, over the length of edges (default: 0.01)"
+    add("--surface-tolerance", type=float, default=0.01, metavar="PART", help=help)
     help = "hold the nodes of elements stretched beyond A, a number above 1 (default: none)"
     add("--freeze-aspect", type=float, default=None, metavar="A", help=help)
     help = "hold the nodes of a named set; repeatable (default: none but those that the file marks)"

@@ -102,7 +102,7 @@ def pipe(kind, amplitude=0.0):
 def test_curved_side_is_held_but_slides_along_its_straight_lines(kind):
     parameters, points, blocks = pipe(kind)
     turn = meshes.rotation_matrix(3, 2)
-    found = detect_constraints(Mesh(points @ turn.T, blocks))
+    found = detect_constraints(Mesh(points @ turn.T, blocks), boundary="planar")
     curved = np.abs(parameters[:, 0] - 0.5) > 0.5 - 1e-9
     ends = meshes.box_normals(parameters)
     angle = parameters[:, 1] * np.pi / 2
@@ -128,7 +128,7 @@ def test_feature_angle_tells_folds_of_a_curve_from_edges():
     inner = radius_side & (parameters[:, 1] % 1 > 1e-9) & (parameters[:, 2] % 1 > 1e-9)
     edges = radius_side & (parameters[:, 1] % 1 < 1e-9) & (parameters[:, 2] % 1 > 1e-9)
     for angle, freedom in ((0.0, 1), (25.0, 1), (35.0, 0)):
-        found = detect_constraints(Mesh(points, blocks), feature_angle=angle).freedom
+        found = detect_constraints(Mesh(points, blocks), boundary="planar", feature_angle=angle).freedom
         np.testing.assert_array_equal(found[inner], freedom)
         np.testing.assert_array_equal(found[edges], 1)  # real edges of the pipe, near 90°
         assert (found == 2).any()
@@ -142,7 +142,7 @@ def test_flatness_can_be_given():
     side = (points[:, 0] > 0) & (points[:, 0] < 1) & (np.abs(points[:, 1] - 0.005) < 0.006)
     assert side.sum() == 3
     mesh = Mesh(points, blocks)
-    np.testing.assert_array_equal(detect_constraints(mesh).freedom[side], 0)
+    np.testing.assert_array_equal(detect_constraints(mesh, boundary="planar").freedom[side], 0)
     np.testing.assert_array_equal(detect_constraints(mesh, flatness=0.02).freedom[side], 1)
 
 
@@ -171,7 +171,7 @@ def test_fixed_nodes_by_mask_and_by_index():
 
 def test_wrong_arguments_are_refused():
     mesh = Mesh(*meshes.grid("quad"))
-    with pytest.raises(ValueError, match="boundary must be 'slide' or 'fixed', got 'glue'"):
+    with pytest.raises(ValueError, match="boundary must be 'slide', 'planar' or 'fixed', got 'glue'"):
         detect_constraints(mesh, boundary="glue")
     with pytest.raises(ValueError, match="interfaces must be"):
         detect_constraints(mesh, interfaces="open")
@@ -373,15 +373,15 @@ SCALED = {
 @pytest.mark.parametrize("power", [-30, 20])
 def test_units_that_differ_by_a_power_of_two_change_nothing(name, power):
     points, blocks = SCALED[name]()
-    one = np.asarray(detect_constraints(Mesh(points, blocks)).projectors)
-    other = np.asarray(detect_constraints(Mesh(points * 2.0**power, blocks)).projectors)
+    one = np.asarray(detect_constraints(Mesh(points, blocks), boundary="planar").projectors)
+    other = np.asarray(detect_constraints(Mesh(points * 2.0**power, blocks), boundary="planar").projectors)
     assert one.dtype == np.float64
     np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("name", SCALED)
 def test_projectors_are_exact(name):
-    found = np.asarray(detect_constraints(Mesh(*SCALED[name]())).projectors)
+    found = np.asarray(detect_constraints(Mesh(*SCALED[name]()), boundary="planar").projectors)
     np.testing.assert_array_equal(found, found.swapaxes(1, 2))
     np.testing.assert_allclose(found @ found, found, atol=1e-15)
     if name in ("dyadic", "few digits", "quarters"):  # sides normal to the axes

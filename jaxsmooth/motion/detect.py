@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsmooth.cells.table import element_type
+from jaxsmooth.cells.table import ElementType, element_type
 from jaxsmooth.convert.meshfile import as_mesh
 from jaxsmooth.mesh.layers import layer_nodes, nodes_of, stretched
-from jaxsmooth.mesh.record import Labels
+from jaxsmooth.mesh.record import Labels, Mesh
 from jaxsmooth.mesh.topology import facet_keys, find_facets
+from jaxsmooth.metrics.summary import evaluated
 from jaxsmooth.motion.base import Motion
 from jaxsmooth.motion.coupled import couple
 from jaxsmooth.motion.directions import Directions, Noise, facet_normals, unit_tangents
+from jaxsmooth.motion.features import FEATURE_ANGLE
 from jaxsmooth.motion.planar import Constraints, node_mask
+from jaxsmooth.motion.sides import Segments, segments_of, unique_sides
+from jaxsmooth.motion.sliding import Kept, find_sliding
 
 __all__ = ["detect_constraints"]
+
+Nearest = Callable[[Any], Any]
 
 
 def detect_constraints(
@@ -25,45 +32,53 @@ def detect_constraints(
     *,
     boundary: str = "slide",
     interfaces: str = "slide",
-    feature_angle: float = 0.0,
+    feature_angle: float | None = None,
     flatness: float | None = None,
     fixed: Any = None,
     layers: str = "hold",
     freeze_aspect: float | None = None,
+    surface_tolerance: float = 0.01,
+    surfaces: Mapping[str, Nearest] | Sequence[tuple[Any, Nearest]] = (),
 ) -> Motion:
     """Find how every node may move so that the shape of the domain is kept.
 
-    Boundary nodes slide within flat faces and along straight edges and are held elsewhere.
-    So do nodes of interfaces between regions (`Mesh.labels`), of embedded surfaces and lines
-    that the mesh names, and of the borders between boundary cells of different tags.
+    Boundary nodes slide within flat faces, along straight edges, on curved faces and along curved edges;
+    corners are held.  So do nodes of interfaces between regions (`Mesh.labels`), of embedded surfaces and
+    lines that the mesh names, and of the borders between boundary cells of different tags.
+
     Nodes that belong together (`Labels.links`) move together.
 
+    Curved faces are quadratic patches through the nodes, and quadratic facets as they are.
+
     Args:
-        mesh: a `Mesh`, or whatever else `as_mesh` takes.
-        boundary: ``"slide"``, or ``"fixed"`` to hold every boundary node.
+        mesh: a `Mesh`, a `MeshFile`, or whatever else `as_mesh` takes.
+        boundary: ``"slide"``; ``"planar"`` to hold the nodes of what is curved; or ``"fixed"`` to hold every
+            boundary node.
         interfaces: the same choice for interfaces between regions.
-        feature_angle: degrees.  A straight fold shallower than this belongs to a curved face,
-            whose nodes are held; by default every straight fold is an edge to slide along.
+        feature_angle: degrees.  A sharper fold, or bend of a curve, is an edge (a corner) of the shape; 50 by
+            default.  With ``"planar"``: a straight fold that is shallower belongs to a curved face, whose
+            nodes are held; by default every straight fold is an edge to slide along.
         flatness: angle in radians below which facets lie in one plane.  By default it follows
             from the precision of the coordinates and the size of each facet (1e-4 at least).
         fixed: nodes to hold besides those of `Labels.held`: a mask ``[nodes]`` or indices.
         layers: ``"hold"`` to hold the nodes of boundary layers (`layer_nodes`), whose elements are
             stretched on purpose, or ``"free"``.
         freeze_aspect: hold the nodes of all elements of a greater aspect ratio (`aspect_ratios`).
+        surface_tolerance: how far nodes may get away from the facets that they were on, over the length of
+            the edges there.  The surface through the nodes of coarse facets is farther away than that (by
+            an eighth of the angle of the fold) and is cut off there.
+        surfaces: functions that give the nearest points of surfaces, ``[m, dim] -> [m, dim]`` (see
+            `on_surface`), by the name of a set of a `MeshFile`, or in pairs with a mask ``[nodes]`` or
+            indices.  A facet is on such a surface if all its nodes are.
 
     Returns:
-        `Constraints`, or `Coupled` ones where nodes follow others.
+        `Constraints`; `Sliding` where a node slides on something curved; `Coupled` where nodes follow others.
 
     Raises:
-        ValueError: for an unknown choice, a mask of another length, or an aspect ratio below 1.
+        ValueError: for an unknown choice or set, a mask of another length, or a number out of range.
     """
-    for name, choice in (("boundary", boundary), ("interfaces", interfaces)):
-        if choice not in ("slide", "fixed"):
-            raise ValueError(f"{name} must be 'slide' or 'fixed', got {choice!r}")
-    if layers not in ("hold", "free"):
-        raise ValueError(f"layers must be 'hold' or 'free', got {layers!r}")
-    if freeze_aspect is not None and not freeze_aspect >= 1:
-        raise ValueError(f"freeze_aspect must be 1 or more, got {freeze_aspect}")
+    _check(boundary, interfaces, layers, freeze_aspect, surface_tolerance)
+    sets = getattr(mesh, "named_sets", {})
     mesh = as_mesh(mesh)
     points = np.asarray(mesh.points, np.float64)
     count, dim = points.shape
@@ -71,12 +86,14 @@ def detect_constraints(
     held = node_mask(fixed, count)
     size = float(np.ptp(points, axis=0).max())
     normals, tangents = Directions(count, dim, size), Directions(count, dim, size)
+    functions = _functions(surfaces, sets, count)
 
     all_facets = find_facets(mesh)
     if layers == "hold":
         held |= layer_nodes(mesh, all_facets)
     if freeze_aspect is not None:
         held |= nodes_of(mesh, stretched(mesh, freeze_aspect))
+    bound, parts = np.zeros(count, bool), []
     for facets in all_facets:
         outer = facets.partner < 0
         between = ~outer & (facets.partner != facets.region)
@@ -84,23 +101,104 @@ def detect_constraints(
             nodes = facets.nodes[chosen]
             if choice == "fixed":
                 held[nodes] = True
-            else:
-                normals.add(nodes, facet_normals(facets.type, points[nodes], noise.at(nodes), flatness))
+                continue
+            normals.add(nodes, facet_normals(facets.type, points[nodes], noise.at(nodes), flatness))
+            if choice == "planar":
+                bound[nodes] = True
+                continue
+            one = chosen & ((facets.partner < 0) | (facets.region < facets.partner))  # of two sides
+            regions = np.stack([facets.region[one], facets.partner[one]], axis=1)
+            parts.append((facets.type, facets.nodes[one], regions))
     if mesh.labels is not None:
         if mesh.labels.held is not None:
             held |= node_mask(mesh.labels.held, count)
         _add_features(mesh.labels, points, noise, flatness, normals, tangents, held)
 
+    curved = "slide" in (boundary, interfaces)
+    projectors, flat = _planar(normals, tangents, 0.0 if boundary == "slide" else feature_angle or 0.0)
+    if not curved:
+        projectors[held] = 0
+        return couple(Constraints(jnp.asarray(projectors, mesh.points.dtype)), mesh)
+    bound |= _tangled(mesh)
+    tagged, tags, lines = _tagged(mesh.labels, points)
+    masks = [mask for mask, _ in functions]
+    sides = unique_sides([*parts, *tagged], tags, masks, count)
+    kept = Kept(points, noise, projectors, flat, sides, lines, held, bound, functions)
+    angle = FEATURE_ANGLE if feature_angle is None else feature_angle
+    return couple(find_sliding(kept, angle, surface_tolerance, flatness, mesh.points.dtype), mesh)
+
+
+def _check(
+    boundary: str, interfaces: str, layers: str, freeze_aspect: float | None, tolerance: float
+) -> None:
+    for name, choice in (("boundary", boundary), ("interfaces", interfaces)):
+        if choice not in ("slide", "planar", "fixed"):
+            raise ValueError(f"{name} must be 'slide', 'planar' or 'fixed', got {choice!r}")
+    if layers not in ("hold", "free"):
+        raise ValueError(f"layers must be 'hold' or 'free', got {layers!r}")
+    if freeze_aspect is not None and not freeze_aspect >= 1:
+        raise ValueError(f"freeze_aspect must be 1 or more, got {freeze_aspect}")
+    if not 0 <= tolerance <= 1:
+        raise ValueError(f"surface_tolerance must be 0 to 1, got {tolerance}")
+
+
+def _tangled(mesh: Mesh) -> np.ndarray:
+    """Nodes of inverted elements with mid-side nodes ``[nodes]``.
+
+    Moves of corners and mid-side nodes along the surface get into each other's way there: interior nodes
+    alone untangle more.
+    """
+    found = np.zeros(len(mesh.points), bool)
+    if all(kind.linear for kind, _ in mesh.blocks):
+        return found
+    for (kind, nodes), det in zip(mesh.blocks, evaluated(mesh.bare).jacobian, strict=True):
+        if not kind.linear:
+            found[np.asarray(nodes)[~(np.asarray(det) > 0)]] = True
+    return found
+
+
+def _functions(surfaces: Any, sets: Mapping[str, Any], count: int) -> list[tuple[np.ndarray, Nearest]]:
+    """A mask ``[nodes]`` and a function for each given surface."""
+    if not isinstance(surfaces, Mapping):
+        return [(node_mask(nodes, count), nearest) for nodes, nearest in surfaces]
+    for name in surfaces:
+        if name not in sets:
+            known = ", ".join(sets) or "none"
+            raise ValueError(f"unknown set {name!r} in surfaces; the mesh has {known}")
+    return [(node_mask(sets[name], count), nearest) for name, nearest in surfaces.items()]
+
+
+def _planar(normals: Directions, tangents: Directions, feature_angle: float) -> tuple[np.ndarray, np.ndarray]:
+    """Projectors of the planar rule ``[nodes, dim, dim]``, and the nodes whose facets lie in one plane."""
+    count, dim = normals.count, normals.dim
     projectors = np.tile(np.eye(dim), (count, 1, 1))
     on_facets, free = normals.null_space()
+    flat = np.zeros(count, bool)
+    flat[on_facets] = np.rint(np.trace(free, axis1=1, axis2=2)) == dim - 1
     if feature_angle > 0:
         free[normals.fold_angles(on_facets, free) < np.deg2rad(feature_angle)] = 0
     projectors[on_facets] = free
     on_lines, line = tangents.common_line()
     stays = np.einsum("nij,njk,nki->n", projectors[on_lines], line, line) > 1 - 1e-6
     projectors[on_lines] = line * stays[:, None, None]
-    projectors[held] = 0
-    return couple(Constraints(jnp.asarray(projectors, mesh.points.dtype)), mesh)
+    return projectors, flat
+
+
+def _tagged(
+    labels: Labels | None, points: np.ndarray
+) -> tuple[list[tuple[ElementType, np.ndarray, np.ndarray]], tuple[np.ndarray, np.ndarray], list[Segments]]:
+    """Tagged surfaces as lists of facets, the keys and tags of their facets, and tagged lines."""
+    surfaces, keys, tags, lines = [], [np.zeros(0, np.int64)], [np.zeros(0, int)], []
+    if labels is not None:
+        for name, nodes, tag in zip(labels.feature_types, labels.features, labels.feature_tags, strict=True):
+            kind = None if name == "vertex" else element_type(name)
+            if kind is not None and kind.dim == 1:
+                lines.append(segments_of(kind, nodes, points))
+            elif kind is not None and points.shape[1] == 3:
+                surfaces.append((kind, nodes, np.full((len(nodes), 2), -2)))
+                keys.append(facet_keys(nodes[:, : kind.corners], len(points)))
+                tags.append(tag)
+    return surfaces, (np.concatenate(keys), np.concatenate(tags)), lines
 
 
 def _add_features(

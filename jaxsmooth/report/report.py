@@ -21,9 +21,11 @@ from rich.table import Table
 from jaxsmooth.convert.meshfile import MeshFile
 from jaxsmooth.files.outputs import Outputs
 from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.mesh.topology import signed_measures
 from jaxsmooth.metrics.summary import POOR, corners, evaluated
 from jaxsmooth.metrics.validity import inverted
 from jaxsmooth.motion.base import Motion
+from jaxsmooth.motion.curved import Sliding
 from jaxsmooth.runs.driver import SmoothResult, StepRecord
 
 __all__ = [
@@ -215,6 +217,9 @@ def print_constraints(out: Console, constraints: Motion, mesh: Mesh) -> None:
     if tangents.links is not None:
         parts.append(f"{len(tangents.links.dependent):,} of them following others")
     out.print(f"nodes: {', '.join(parts)}")
+    if isinstance(constraints, Sliding):
+        parts = [f"{number:,} {where}" for where, number in constraints.counts.items()]
+        out.print(f"of those that slide: {', '.join(parts)}")
 
 
 def print_step(out: Console, row: StepRecord) -> None:
@@ -255,6 +260,15 @@ def print_comparison(out: Console, before: Mesh, result: SmoothResult) -> None:
     for row in comparison(before, result):
         table.add_row(*row)
     out.print(table)
+    if isinstance(result.constraints, Sliding):
+        first, last = (
+            sum(
+                signed_measures(kind, np.asarray(m.points), np.asarray(nodes)).sum()
+                for kind, nodes in m.blocks
+            )
+            for m in (before, result.mesh)
+        )
+        out.print(f"{'area' if before.dim == 2 else 'volume'} changed by {(last - first) / first:+.2e}")
 
 
 def _number(value: float | None) -> str:

@@ -56,7 +56,8 @@ def stack(meshes: Sequence[Any], constraints: Sequence[Motion] | None = None) ->
 
     Args:
         meshes: each a `Mesh` or whatever else `as_mesh` takes; their blocks may differ in size and type.
-        constraints: theirs, `Constraints` each; detected by default.
+        constraints: theirs, `Constraints` each; by default those of flat faces and straight edges
+            (``boundary="planar"``).
 
     Returns:
         The batch.
@@ -67,13 +68,15 @@ def stack(meshes: Sequence[Any], constraints: Sequence[Motion] | None = None) ->
     meshes = [as_mesh(mesh) for mesh in meshes]
     if not meshes or len({mesh.dim for mesh in meshes}) > 1:
         raise ValueError("stack needs meshes of one dimension, at least one")
-    constraints = [detect_constraints(m) for m in meshes] if constraints is None else constraints
+    if constraints is None:
+        constraints = [detect_constraints(m, boundary="planar", interfaces="planar") for m in meshes]
     motions: list[Constraints] = []
     for index, motion in enumerate(constraints):
         if not isinstance(motion, Constraints):
             raise ValueError(
-                f"stack pads Constraints, and mesh {index} has {type(motion).__name__}; where its nodes move "
-                "together, hold them: Constraints.hold(mesh, mesh.labels.links.members(len(mesh.points)))"
+                f"stack pads Constraints, and mesh {index} has {type(motion).__name__}; detect them with "
+                "boundary='planar', and hold the nodes that move together: "
+                "Constraints.hold(mesh, mesh.labels.links.members(len(mesh.points)))"
             )
         motions.append(motion)
     types = sorted({name for mesh in meshes for name in mesh.types})
