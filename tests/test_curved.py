@@ -192,6 +192,19 @@ def test_one_facet_askew_is_no_edge():
     assert (freedom[rim] == 2).sum() >= len(rim) - 3  # but for those that keep the ball from turning
 
 
+def test_nodes_on_a_ridge_slide_along_it():
+    """Folds of 30° are no edges, but too sharp to be left: of 10° they are not."""
+    for many, freedom in ((3, 1), (9, 2)):
+        mesh, parameters = pipe("hexahedron", (3, many, 3))
+        inside = (np.abs(parameters[:, 1:] - 0.5) < 0.5 - 1e-9).all(axis=1)
+        on = inside & (np.abs(parameters[:, 0] - 0.5) > 0.5 - 1e-9)
+        admissible = js.detect_constraints(mesh).at(mesh.points)
+        np.testing.assert_array_equal(admissible.freedom[on], freedom)
+        found = np.asarray(admissible.projectors)[on]
+        np.testing.assert_allclose(found @ [0.0, 0, 1], [[0, 0, 1]] * int(on.sum()), atol=0.02)  # fits
+        np.testing.assert_allclose(found @ found, found, atol=1e-9)
+
+
 # --- The surface ---------------------------------------------------------------------------------
 
 ROUND = {

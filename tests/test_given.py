@@ -197,8 +197,8 @@ def test_derivative_of_a_run_by_the_parameters_of_a_surface(name):
             assert float(found[i]) == pytest.approx(float(expected), rel=1e-5, abs=1e-7)
 
 
-def test_interfaces_between_regions_keep_their_volumes():
-    """A ball in a box of another region: its surface slides, and neither region grows."""
+def test_interfaces_between_regions_slide_where_they_are_curved():
+    """A ball within a ball of another region; its facets are coarse: some nodes are on ridges."""
     mesh = ball("tetra", 8)
     points = np.asarray(mesh.points)
     nodes = np.asarray(mesh.connectivity[0])
@@ -207,7 +207,8 @@ def test_interfaces_between_regions_keep_their_volumes():
     mesh = js.Mesh(points, {"tetra": nodes}, labels)
     shared = np.intersect1d(nodes[inside], nodes[~inside])
     freedom = js.detect_constraints(mesh).at(mesh.points).freedom
-    assert (freedom[shared] == 2).mean() > 0.9
+    assert (freedom[shared] == 2).mean() > 0.5
+    assert (freedom[shared] >= 1).mean() > 0.95
     held = js.detect_constraints(mesh, interfaces="fixed")
     np.testing.assert_array_equal(held.at(mesh.points).freedom[shared], 0)
     planar = js.detect_constraints(mesh, interfaces="planar")

@@ -23,7 +23,8 @@ __all__ = ["Carrier", "Patches", "Sliding"]
 
 Field = Float[Array, "nodes dim"]
 
-_WALK = 60  # patches and Newton steps on the way to a nearest point
+_WALK = 40  # patches and Newton steps on the way to a nearest point
+_IDLE = 8  # patches that meet at a vertex: a walk that goes round it more than once has arrived
 _TURNS = 2  # times a walk may go back over the same edge before it stays on it
 
 
@@ -109,12 +110,24 @@ class Sliding(Motion):
 def _shared(
     one: Float[Array, "sliding dim dim"], tangents: Float[Array, "sliding dim dim"]
 ) -> Float[Array, "sliding dim dim"]:
-    """Projectors onto the tangents, or onto the line in them that is nearest to a line."""
-    both = tangents @ one @ tangents
+    """Projectors onto what two have in common: a plane within space, a line of two planes, or a line.
+
+    A line that is not quite in the tangents is replaced by the nearest one that is.
+    """
+    dim = one.shape[-1]
     rank = jnp.trace(one, axis1=-2, axis2=-1)[:, None, None]
+    both = tangents @ one @ tangents
     size = jnp.trace(both, axis1=-2, axis2=-1)[:, None, None]
     line = (rank < 1.5) & (size > 0.25)
-    return jnp.where(line, both / jnp.where(line, size, 1), jnp.where(rank > one.shape[-1] - 0.5, both, 0))
+    found = jnp.where(line, both / jnp.where(line, size, 1), jnp.where(rank > dim - 0.5, both, 0))
+    if dim == 2:
+        return found
+    # what neither leaves out: the cofactors of the sum of the complements are those of its null space
+    rest = 2 * jnp.eye(dim, dtype=one.dtype) - one - tangents
+    null = cofactors(rest)
+    size = jnp.trace(null, axis1=-2, axis2=-1)[:, None, None]
+    planes = (rank > 1.5) & (rank < 2.5) & (size > 0.01)
+    return jnp.where(planes, null / jnp.where(planes, size, 1), found)
 
 
 # --- Quadratic patches ------------------------------------------------------------------------------
@@ -193,13 +206,14 @@ class _Place(NamedTuple):
     """Where on the patches: a patch, barycentric coordinates; then how a walk got there.
 
     `entry` is the side of the patch over which the walk came (−1 for none), `turns` how often in a row it has
-    come back over the same edge.
+    come back over the same edge, `idle` how many patches in a row it has crossed without getting anywhere.
     """
 
     patch: Int[Array, ""]
     weights: Float[Array, " v"]
     entry: Int[Array, ""]
     turns: Int[Array, ""]
+    idle: Int[Array, ""]
     count: Int[Array, ""]
     done: Bool[Array, ""]
 
@@ -318,8 +332,10 @@ def _walk(
         taken = jnp.where(crosses, (same * weights).sum(axis=1), weights)
         turns = jnp.where(crosses, jnp.where(back, place.turns + 1, 0), place.turns)
         entry = jnp.where(crosses, jnp.argmin(same.any(axis=1)).astype(jnp.int32), place.entry)
-        return _Place(patch, taken, entry, turns, place.count + 1, there)
+        length = jnp.minimum(part[side], 1) * jnp.abs(step).max()
+        idle = jnp.where(crosses & (length <= tolerance), place.idle + 1, 0)
+        return _Place(patch, taken, entry, turns, idle, place.count + 1, there | (idle >= _IDLE))
 
     zero = jnp.int32(0)
-    first = _Place(home, start, jnp.int32(-1), zero, zero, jnp.bool_(False))
+    first = _Place(home, start, jnp.int32(-1), zero, zero, zero, jnp.bool_(False))
     return jax.lax.while_loop(lambda p: ~p.done & (p.count < _WALK), advance, first)

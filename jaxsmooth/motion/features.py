@@ -11,13 +11,14 @@ from scipy.sparse.csgraph import connected_components
 from jaxsmooth.mesh.topology import pair_codes
 from jaxsmooth.motion.sides import Edges, Sides
 
-__all__ = ["FEATURE_ANGLE", "Faces", "find_faces"]
+__all__ = ["FEATURE_ANGLE", "Faces", "find_faces", "ridges"]
 
 FEATURE_ANGLE = 50.0  # degrees: a fold that is an edge by itself
 _WEAK = 0.5  # part of that angle to which an edge goes on
 _BRANCH = 2  # edges that fade, and are too few to be an edge of their own
 _CHAIN = 3  # edges that a chain of folds needs, if it does not start at other features
 _CONTRAST, _SHALLOW = 4.0, np.deg2rad(8.0)  # a fold so many times sharper than all around it is an edge
+_RIDGE = 25.0  # degrees
 _LEVEL = 4.0  # tolerances by which a facet may be off the plane of its flat face
 
 
@@ -84,6 +85,23 @@ def find_faces(
     strong, weak = _folds(edges, fold, np.deg2rad(feature_angle))
     feature = _pruned(edges, sure | _chains(edges, sure, strong, weak), sure, strong, fold)
     return Faces(edges, feature, flat, given, *_vertices(edges, ~feature))
+
+
+def ridges(faces: Faces, points: np.ndarray) -> np.ndarray:
+    """Projectors onto the directions in which normals change little around nodes ``[nodes, 3, 3]``.
+
+    The root mean square of what facet normals have along a direction is half the fold of a ridge across
+    it.  A node that left a ridge as sharp as `_RIDGE` would take it along, even on a smooth surface.
+    """
+    edges, count = faces.edges, len(points)
+    corner = np.zeros((len(edges.node), 3))
+    corner[edges.corner[:, 0]] = edges.normal
+    total, weight = np.zeros((count, 3, 3)), np.bincount(edges.node, minlength=count)
+    np.add.at(total, edges.node, np.einsum("ci,cj->cij", corner, corner))
+    value, vector = np.linalg.eigh(total / np.maximum(weight, 1)[:, None, None])
+    free = value <= np.sin(np.deg2rad(_RIDGE) / 2) ** 2
+    free[:, 2] = True  # the normal itself is left to the surface
+    return np.einsum("nij,nj,nkj->nik", vector, free, vector)
 
 
 def _flat_facets(

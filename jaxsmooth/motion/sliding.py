@@ -13,7 +13,7 @@ from jaxsmooth.mesh.topology import lengths, pair_codes
 from jaxsmooth.motion.curved import Carrier, Patches, Sliding
 from jaxsmooth.motion.curves import Curves, Layout, Located, find_curves
 from jaxsmooth.motion.directions import Noise, facet_normals
-from jaxsmooth.motion.features import Faces, find_faces
+from jaxsmooth.motion.features import Faces, find_faces, ridges
 from jaxsmooth.motion.given import given
 from jaxsmooth.motion.planar import Constraints
 from jaxsmooth.motion.sides import Segments, Sides, segments_of
@@ -187,6 +187,7 @@ def _motion(
         layout = build_surfaces(kept.sides, faces, points, rims, bound, np.deg2rad(angle))
         located = layout.located.select(roles.on, layout.corners.mean(axis=1))
         layouts.append((layout, located, faces.edges.segments.ends))
+        projectors[roles.on] = ridges(faces, points)[roles.on]
     surfaces = [
         given(np.flatnonzero(mask), nearest)
         for mask, (_, nearest) in zip(roles.given, kept.surfaces, strict=True)
@@ -196,7 +197,9 @@ def _motion(
         return Constraints(jnp.asarray(projectors, dtype))
     tangents = projectors.copy()
     for layout, located, _ in layouts:
-        tangents[located.nodes] = layout.tangents(located)
+        normal = np.eye(dim) - layout.tangents(located)
+        both = projectors[located.nodes]  # a ridge takes one direction from the tangents
+        tangents[located.nodes] = layout.tangents(located) if dim == 2 else both - normal
     for carrier in surfaces:
         nodes = np.asarray(carrier.nodes)
         only = nodes[roles.alone[nodes]]
