@@ -286,7 +286,7 @@ def test_a_fixed_point_keeps_pairs_together():
 
 def test_stack_says_what_to_do():
     mesh = periodic_square()
-    with pytest.raises(ValueError, match="mesh 1 has Coupled; where its nodes move together, hold them"):
+    with pytest.raises(ValueError, match="mesh 1 has Coupled; detect them"):
         js.stack([mesh.with_labels(None), mesh])
     held = js.Constraints.hold(mesh, mesh.labels.links.members(len(mesh.points)))
     assert len(js.stack([mesh], [held]).points()) == 1

@@ -119,7 +119,7 @@ def detect_constraints(
     if not curved:
         projectors[held] = 0
         return couple(Constraints(jnp.asarray(projectors, mesh.points.dtype)), mesh)
-    bound |= _tangled(mesh)
+    bound |= _tangled(mesh) | _linked(mesh)
     tagged, tags, lines = _tagged(mesh.labels, points)
     masks = [mask for mask, _ in functions]
     sides = unique_sides([*parts, *tagged], tags, masks, count)
@@ -140,6 +140,14 @@ def _check(
         raise ValueError(f"freeze_aspect must be 1 or more, got {freeze_aspect}")
     if not 0 <= tolerance <= 1:
         raise ValueError(f"surface_tolerance must be 0 to 1, got {tolerance}")
+
+
+def _linked(mesh: Mesh) -> np.ndarray:
+    """Nodes that follow others or lead them ``[nodes]``: facets that others hang on do not meet theirs."""
+    found = np.zeros(len(mesh.points), bool)
+    if mesh.labels is not None and mesh.labels.links is not None:
+        found[mesh.labels.links.nodes] = found[mesh.labels.links.parents] = True
+    return found
 
 
 def _tangled(mesh: Mesh) -> np.ndarray:
