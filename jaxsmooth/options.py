@@ -85,9 +85,9 @@ def _add_run_options(command: argparse.ArgumentParser) -> None:
     add("--goal", choices=GOALS, default=None, metavar="NAME", help=help)
     choices = ("slide", "planar", "fixed")
     help = "boundary nodes slide on faces and edges, planar: on flat and straight ones only, or are fixed"
-    add("--boundary", choices=choices, default="slide", help=f"{help} (default: slide)")
-    help = "the same for the nodes between materials (default: slide)"
-    add("--interfaces", choices=choices, default="slide", help=help)
+    add("--boundary", choices=choices, default="planar", help=f"{help} (default: planar)")
+    help = "the same for the nodes between materials (default: planar)"
+    add("--interfaces", choices=choices, default="planar", help=help)
     help = "folds sharper than this are edges (default: 50; with planar 0: all straight ones)"
     add("--feature-angle", type=float, default=None, metavar="DEG", help=help)
     help = "distance that nodes keep to the facets of the input, over the length of edges (default: 0.01)"

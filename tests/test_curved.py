@@ -20,6 +20,8 @@ from jaxsmooth.numerics.small import Frame
 
 # --- Meshes ------------------------------------------------------------------------------------
 
+slide = partial(js.detect_constraints, boundary="slide", interfaces="slide")
+
 
 def round_off(square):
     """The cube [−1, 1]ⁿ to the unit ball, its boundary to the sphere."""
@@ -97,7 +99,7 @@ def sliding_nodes(motion):
 def test_freedom_of_a_pipe(kind):
     linear = kind in ("tetra", "hexahedron", "wedge")
     mesh, parameters = pipe(kind, (3, 9, 3) if linear else (2, 4, 2))
-    motion = js.detect_constraints(mesh)
+    motion = slide(mesh)
     freedom = motion.at(mesh.points).freedom
     np.testing.assert_array_equal(freedom, [3 - len(s) for s in meshes.box_normals(parameters)])
     round_ = np.abs(parameters[:, 0] - 0.5) > 0.5 - 1e-9
@@ -115,7 +117,7 @@ def test_freedom_of_a_pipe(kind):
 @pytest.mark.parametrize("kind", ["quad", "triangle", "triangle6", "quad9"])
 def test_boundary_of_a_disc(kind):
     mesh = disc(kind, 6)
-    motion = js.detect_constraints(mesh, surface_tolerance=0.1)
+    motion = slide(mesh, surface_tolerance=0.1)
     rim = off_sphere(np.asarray(mesh.points)) < 1e-9
     if kind in ("quad", "triangle"):
         freedom = motion.at(mesh.points).freedom
@@ -152,7 +154,7 @@ def bent_plate(angle, n=6):
 @pytest.mark.parametrize("angle", [1.0, 10.0, 60.0])
 def test_a_fold_between_flat_faces_is_kept_however_shallow(angle):
     mesh, x = bent_plate(angle)
-    motion = js.detect_constraints(mesh)
+    motion = slide(mesh)
     assert isinstance(motion, js.Constraints)
     np.testing.assert_array_equal(motion.freedom, js.detect_constraints(mesh, boundary="planar").freedom)
     assert (motion.freedom[np.abs(x) < 1e-9] <= 1).sum() > 10
@@ -171,7 +173,7 @@ def folded_dome(angle, noise=0.0, n=12):
 @pytest.mark.parametrize("angle", [25.0, 70.0])
 def test_a_crease_between_curved_faces_is_an_edge(angle, noise):
     mesh, (x, y, z) = folded_dome(angle, noise)
-    motion = js.detect_constraints(mesh)
+    motion = slide(mesh)
     freedom = motion.at(mesh.points).freedom
     crease = (np.abs(x) < 1e-9) & (z == 1) & (y > 1e-9) & (y < 1 - 1e-9)
     np.testing.assert_array_equal(freedom[crease], 1)
@@ -188,7 +190,7 @@ def test_one_facet_askew_is_no_edge():
     node = rim[np.argmin(np.linalg.norm(points[rim] - [0.6, 0.64, 0.48], axis=1))]
     points[node] *= 1.02
     mesh = mesh.with_points(jnp.asarray(points))
-    freedom = js.detect_constraints(mesh).at(mesh.points).freedom
+    freedom = slide(mesh).at(mesh.points).freedom
     assert (freedom[rim] == 2).sum() >= len(rim) - 3  # but for those that keep the ball from turning
 
 
@@ -198,7 +200,7 @@ def test_nodes_on_a_ridge_slide_along_it():
         mesh, parameters = pipe("hexahedron", (3, many, 3))
         inside = (np.abs(parameters[:, 1:] - 0.5) < 0.5 - 1e-9).all(axis=1)
         on = inside & (np.abs(parameters[:, 0] - 0.5) > 0.5 - 1e-9)
-        admissible = js.detect_constraints(mesh).at(mesh.points)
+        admissible = slide(mesh).at(mesh.points)
         np.testing.assert_array_equal(admissible.freedom[on], freedom)
         found = np.asarray(admissible.projectors)[on]
         np.testing.assert_allclose(found @ [0.0, 0, 1], [[0, 0, 1]] * int(on.sum()), atol=0.02)  # fits
@@ -220,7 +222,7 @@ ROUND = {
 def test_nodes_stay_on_the_true_surface(name):
     make, off = ROUND[name]
     mesh = make()
-    motion = js.detect_constraints(mesh, surface_tolerance=0.1)
+    motion = slide(mesh, surface_tolerance=0.1)
     points, nodes, local = wander(mesh, motion), sliding_nodes(motion), edge_length(mesh)
     assert np.median(np.linalg.norm(points - np.asarray(mesh.points), axis=1)[nodes] / local[nodes]) > 0.5
     distance = (off(points) / local)[nodes]
@@ -234,7 +236,7 @@ def test_the_surface_converges_with_the_fourth_power_of_the_angle():
     distance = []
     for n in (6, 12):
         mesh = ball("hexahedron", n)
-        motion = js.detect_constraints(mesh, surface_tolerance=0.1)
+        motion = slide(mesh, surface_tolerance=0.1)
         points = wander(mesh, motion, steps=4)
         distance.append(off_sphere(points)[sliding_nodes(motion)].mean())
     assert distance[1] < distance[0] / 2**3.5
@@ -243,7 +245,7 @@ def test_the_surface_converges_with_the_fourth_power_of_the_angle():
 @pytest.mark.parametrize("tolerance", [0.0, 0.01])
 def test_nodes_keep_the_distance_to_the_facets(tolerance):
     mesh = ball("tetra", 6)
-    motion = js.detect_constraints(mesh, surface_tolerance=tolerance)
+    motion = slide(mesh, surface_tolerance=tolerance)
     points, nodes = wander(mesh, motion, steps=4), sliding_nodes(motion)
     start = np.asarray(mesh.points)
     (patches,) = motion.carriers
@@ -272,7 +274,7 @@ def test_nearest_points_against_a_minimiser():
     """Of SciPy over single patches: a sample of the ball, and the circle."""
     rng = np.random.default_rng(0)
     for mesh in (ball("tetra", 6), disc("triangle", 6)):
-        motion = js.detect_constraints(mesh, surface_tolerance=0.1)
+        motion = slide(mesh, surface_tolerance=0.1)
         (patches,) = motion.carriers
         chosen = rng.permutation(len(patches.nodes))[:12]
         start = np.asarray(mesh.points)[np.asarray(patches.nodes)]
@@ -314,7 +316,7 @@ def test_quadratic_facets_are_taken_as_they_are(kind):
     """Nodes lie on the surface, whatever the tolerance: the nearest points of nodes are they themselves."""
     dim = meshes.dim_of(kind)
     mesh = disc(kind, 4) if dim == 2 else pipe(kind, (2, 4, 2))[0]
-    motion = js.detect_constraints(mesh, surface_tolerance=0.0)
+    motion = slide(mesh, surface_tolerance=0.0)
     assert motion.carriers
     for carrier in motion.carriers:
         start = mesh.points[carrier.nodes]
@@ -339,7 +341,7 @@ def test_curves_through_points_of_a_circle_are_arcs():
 
 def test_still_nodes_stay_exactly_and_admissible_ones_are_found_again():
     mesh = ball("tetra", 6)
-    motion = js.detect_constraints(mesh)
+    motion = slide(mesh)
     np.testing.assert_array_equal(motion.retract(mesh.points, jnp.zeros_like(mesh.points)), mesh.points)
     points = jnp.asarray(wander(mesh, motion, steps=3))
     move = jnp.full_like(points, 1e-9)
@@ -351,7 +353,7 @@ def test_still_nodes_stay_exactly_and_admissible_ones_are_found_again():
 
 def test_projectors_are_tangent_and_near_the_derivative_of_retract():
     for mesh in (ball("hexahedron", 6), disc("quad", 6)):
-        motion = js.detect_constraints(mesh, surface_tolerance=0.1)
+        motion = slide(mesh, surface_tolerance=0.1)
         points = jnp.asarray(wander(mesh, motion, steps=2))
         projectors = np.asarray(motion.at(points).projectors)
         np.testing.assert_allclose(projectors @ projectors, projectors, atol=1e-12)
@@ -370,7 +372,7 @@ def test_projectors_are_tangent_and_near_the_derivative_of_retract():
 
 def test_derivatives_of_moves_against_differences():
     mesh = ball("tetra", 6)
-    motion = js.detect_constraints(mesh)
+    motion = slide(mesh)
     rng = np.random.default_rng(2)
     points = jnp.asarray(wander(mesh, motion, steps=2))
     start, change, weight = (jnp.asarray(rng.normal(size=points.shape)) for _ in range(3))
@@ -392,7 +394,7 @@ def test_derivatives_of_moves_against_differences():
 @pytest.mark.parametrize("make", [lambda: ball("tetra", 6), lambda: torus("hexahedron", (8, 8, 14))])
 def test_the_frame_changes_nothing(make):
     mesh = make()
-    motion = js.detect_constraints(mesh)
+    motion = slide(mesh)
     frame = Frame.of(5 * mesh.points)
     move = 0.02 * jnp.asarray(np.random.default_rng(3).normal(size=mesh.points.shape))
     inside = motion.within(frame)
@@ -410,14 +412,14 @@ def test_renumbered_nodes_slide_alike():
     number = np.argsort(order)
     other = js.Mesh(mesh.points[order], {"tetra": number[np.asarray(mesh.connectivity[0])][::-1]})
     move = 0.05 * jnp.asarray(np.random.default_rng(1).normal(size=mesh.points.shape))
-    one = js.detect_constraints(mesh).retract(mesh.points, move)
-    two = js.detect_constraints(other).retract(other.points, move[order])
+    one = slide(mesh).retract(mesh.points, move)
+    two = slide(other).retract(other.points, move[order])
     np.testing.assert_allclose(np.asarray(one)[order], two, atol=1e-9)
 
 
 def test_a_move_that_is_too_long_is_shortened():
     mesh = ball("tetra", 6)
-    motion = js.detect_constraints(mesh)
+    motion = slide(mesh)
     points = motion.retract(mesh.points, 100 * jnp.ones_like(mesh.points))
     nodes = sliding_nodes(motion)
     assert np.isfinite(np.asarray(points)[nodes]).all()
@@ -433,7 +435,7 @@ def test_rigid_motions_that_the_surface_allows_are_stopped():
         (torus("hexahedron", (8, 8, 14)), 0),
     ):
         rim = np.zeros(len(mesh.points), bool)
-        motion = js.detect_constraints(mesh)
+        motion = slide(mesh)
         freedom = motion.at(mesh.points).freedom
         planar = js.detect_constraints(mesh, boundary="planar").freedom
         rim = (freedom < mesh.dim) & (planar == 0)
@@ -450,7 +452,7 @@ def test_rigid_motions_that_the_surface_allows_are_stopped():
 
 def test_tangents_of_the_host_are_those_of_the_device():
     for mesh in (torus("tetra", (8, 8, 14)), disc("quad9", 4)):
-        motion = js.detect_constraints(mesh)
+        motion = slide(mesh)
         for carrier in motion.carriers:
             place = Located(*(np.asarray(part) for part in (carrier.nodes, carrier.home, carrier.start)))
             arrays = (carrier.vertices, carrier.neighbours, carrier.corners, carrier.bulges)
@@ -491,7 +493,7 @@ def test_a_valid_mesh_stays_valid_and_gets_better_than_with_a_held_surface(metho
 
 
 def test_every_carrier_is_a_pytree_of_arrays():
-    motion = js.detect_constraints(ball("tetra", 6))
+    motion = slide(ball("tetra", 6))
     assert isinstance(motion, Sliding)
     assert all(isinstance(carrier, Patches) for carrier in motion.carriers)
     assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(motion))

@@ -1,5 +1,7 @@
 """Nodes on surfaces that a function gives, and derivatives of runs that slide on them."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,8 @@ from test_curved import ball, disc, off_sphere, pipe
 import jaxsmooth as js
 from jaxsmooth.motion.given import Given
 from jaxsmooth.numerics.small import Frame
+
+slide = partial(js.detect_constraints, boundary="slide", interfaces="slide")
 
 
 class Ellipsoid(eqx.Module):
@@ -36,7 +40,7 @@ def cylinder(points):
 def test_moves_end_on_the_surface_to_rounding():
     mesh = ball("tetra", 4)
     rim = off_sphere(np.asarray(mesh.points)) < 1e-9
-    motion = js.detect_constraints(mesh, surfaces=[(rim, unit_sphere)])
+    motion = slide(mesh, surfaces=[(rim, unit_sphere)])
     assert motion.counts == {"on given surfaces": rim.sum() - 2}
     freedom = motion.at(mesh.points).freedom
     assert (freedom[rim] == 0).sum() == 2
@@ -56,15 +60,15 @@ def test_coarse_meshes_know_no_edges_on_a_given_surface():
     """Facets of a cube are a poor sphere: what the user says goes before the angles of the folds."""
     mesh = ball("hexahedron", 2)
     rim = off_sphere(np.asarray(mesh.points)) < 1e-9
-    assert (js.detect_constraints(mesh, feature_angle=20.0).at(mesh.points).freedom[rim] < 2).any()
-    motion = js.detect_constraints(mesh, surfaces=[(np.flatnonzero(rim), unit_sphere)], feature_angle=20.0)
+    assert (slide(mesh, feature_angle=20.0).at(mesh.points).freedom[rim] < 2).any()
+    motion = slide(mesh, surfaces=[(np.flatnonzero(rim), unit_sphere)], feature_angle=20.0)
     assert (motion.at(mesh.points).freedom[rim] == 2).sum() == rim.sum() - 2
 
 
 def test_rims_slide_along_what_is_found_and_stay_on_the_given_surface():
     mesh, parameters = pipe("tetra", (3, 9, 3))
     outer = np.abs(parameters[:, 0] - 1) < 1e-9
-    motion = js.detect_constraints(mesh, surfaces=[(outer, cylinder)])
+    motion = slide(mesh, surfaces=[(outer, cylinder)])
     sides = meshes.box_normals(parameters)
     np.testing.assert_array_equal(motion.at(mesh.points).freedom, [3 - len(s) for s in sides])
     move = 0.03 * jnp.asarray(np.random.default_rng(0).normal(size=mesh.points.shape))
@@ -79,12 +83,12 @@ def test_rims_slide_along_what_is_found_and_stay_on_the_given_surface():
 def test_given_curves_of_plane_meshes_and_names_of_sets():
     mesh = disc("triangle", 4)
     rim = off_sphere(np.asarray(mesh.points)) < 1e-9
-    motion = js.detect_constraints(mesh, surfaces=[(rim, unit_sphere)])
+    motion = slide(mesh, surfaces=[(rim, unit_sphere)])
     freedom = motion.at(mesh.points).freedom
     assert (freedom[rim] == 1).sum() == rim.sum() - 1
     assert (freedom[~rim] == 2).all()
     with pytest.raises(ValueError, match="unknown set 'rim' in surfaces; the mesh has none"):
-        js.detect_constraints(mesh, surfaces={"rim": unit_sphere})
+        slide(mesh, surfaces={"rim": unit_sphere})
 
 
 def test_the_frame_changes_nothing_and_frames_follow_one_another():
@@ -159,7 +163,7 @@ def after(mesh, motion, weight, steps=2):
 @pytest.mark.parametrize("name", MESHES)
 def test_derivative_of_a_run_by_interior_points(name):
     mesh, rim, hold, rng = MESHES[name]()
-    motion = js.detect_constraints(mesh, surface_tolerance=0.1, fixed=hold)
+    motion = slide(mesh, surface_tolerance=0.1, fixed=hold)
     change = np.where(rim[:, None], 0, rng.normal(size=mesh.points.shape))
     weight = jnp.asarray(rng.normal(size=mesh.points.shape))
 
@@ -206,10 +210,10 @@ def test_interfaces_between_regions_slide_where_they_are_curved():
     labels = js.Labels((inside.astype(int),))
     mesh = js.Mesh(points, {"tetra": nodes}, labels)
     shared = np.intersect1d(nodes[inside], nodes[~inside])
-    freedom = js.detect_constraints(mesh).at(mesh.points).freedom
+    freedom = slide(mesh).at(mesh.points).freedom
     assert (freedom[shared] == 2).mean() > 0.5
     assert (freedom[shared] >= 1).mean() > 0.95
-    held = js.detect_constraints(mesh, interfaces="fixed")
+    held = slide(mesh, interfaces="fixed")
     np.testing.assert_array_equal(held.at(mesh.points).freedom[shared], 0)
-    planar = js.detect_constraints(mesh, interfaces="planar")
+    planar = slide(mesh, interfaces="planar")
     np.testing.assert_array_equal(planar.at(mesh.points).freedom[shared], 0)

@@ -214,7 +214,7 @@ class _Place(NamedTuple):
     entry: Int[Array, ""]
     turns: Int[Array, ""]
     idle: Int[Array, ""]
-    count: Int[Array, ""]
+    visited: Int[Array, ""]
     done: Bool[Array, ""]
 
 
@@ -334,8 +334,8 @@ def _walk(
         entry = jnp.where(crosses, jnp.argmin(same.any(axis=1)).astype(jnp.int32), place.entry)
         length = jnp.minimum(part[side], 1) * jnp.abs(step).max()
         idle = jnp.where(crosses & (length <= tolerance), place.idle + 1, 0)
-        return _Place(patch, taken, entry, turns, idle, place.count + 1, there | (idle >= _IDLE))
+        return _Place(patch, taken, entry, turns, idle, place.visited + 1, there | (idle >= _IDLE))
 
     zero = jnp.int32(0)
     first = _Place(home, start, jnp.int32(-1), zero, zero, zero, jnp.bool_(False))
-    return jax.lax.while_loop(lambda p: ~p.done & (p.count < _WALK), advance, first)
+    return jax.lax.while_loop(lambda p: ~p.done & (p.visited < _WALK), advance, first)

@@ -30,8 +30,8 @@ Nearest = Callable[[Any], Any]
 def detect_constraints(
     mesh: Any,
     *,
-    boundary: str = "slide",
-    interfaces: str = "slide",
+    boundary: str | None = None,
+    interfaces: str | None = None,
     feature_angle: float | None = None,
     flatness: float | None = None,
     fixed: Any = None,
@@ -42,9 +42,10 @@ def detect_constraints(
 ) -> Motion:
     """Find how every node may move so that the shape of the domain is kept.
 
-    Boundary nodes slide within flat faces, along straight edges, on curved faces and along curved edges;
-    corners are held.  So do nodes of interfaces between regions (`Mesh.labels`), of embedded surfaces and
-    lines that the mesh names, and of the borders between boundary cells of different tags.
+    Boundary nodes slide within flat faces and along straight edges, if asked for on curved faces and along
+    curved edges too; others are held.  So do nodes of interfaces between regions (`Mesh.labels`), of
+    embedded surfaces and lines that the mesh names, and of the borders between boundary cells of
+    different tags.
 
     Nodes that belong together (`Labels.links`) move together.
 
@@ -52,8 +53,9 @@ def detect_constraints(
 
     Args:
         mesh: a `Mesh`, a `MeshFile`, or whatever else `as_mesh` takes.
-        boundary: ``"slide"``; ``"planar"`` to hold the nodes of what is curved; or ``"fixed"`` to hold every
-            boundary node.
+        boundary: ``"planar"``, nodes slide on what is flat or straight, those of what is curved are held;
+            ``"slide"``, they slide there too; or ``"fixed"`` to hold every boundary node.  By default
+            planar, or slide if `surfaces` are given.
         interfaces: the same choice for interfaces between regions.
         feature_angle: degrees.  A sharper fold, or bend of a curve, is an edge (a corner) of the shape; 50 by
             default.  With ``"planar"``: a straight fold that is shallower belongs to a curved face, whose
@@ -77,6 +79,8 @@ def detect_constraints(
     Raises:
         ValueError: for an unknown choice or set, a mask of another length, or a number out of range.
     """
+    usual = "slide" if surfaces else "planar"
+    boundary, interfaces = boundary or usual, interfaces or usual
     _check(boundary, interfaces, layers, freeze_aspect, surface_tolerance)
     sets = getattr(mesh, "named_sets", {})
     mesh = as_mesh(mesh)

@@ -172,8 +172,8 @@ class Edges:
             facets, corners = facets + m, corners + m * kind.corners
         segments = Segments.join(rows)
         other, same = _pair(pair_codes(segments.ends, len(points)))
-        joined = (np.concatenate(part) for part in (facet, corner, normal, node, of))
-        return cls(segments, *joined, other, same)
+        facet, corner, normal = (np.concatenate(part) for part in (facet, corner, normal))
+        return cls(segments, facet, corner, normal, np.concatenate(node), np.concatenate(of), other, same)
 
     @property
     def corners(self) -> np.ndarray:
