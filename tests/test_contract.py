@@ -140,6 +140,7 @@ def test_the_value_beside_a_gradient_is_the_plain_value(name):
 
     plain = float(jax.jit(value)(mesh.points))
     beside, gradient = jax.jit(jax.value_and_grad(value))(mesh.points)
-    assert plain == pytest.approx(float(beside), abs=1e-14)
+    # the two programs round in other ways, and the solver goes on from there
+    assert plain == pytest.approx(float(beside), abs=1e-12)
     assert np.isfinite(gradient).all()
     assert np.abs(gradient).max() > 0
