@@ -5,13 +5,21 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import signal
 import sys
+import threading
 
 __all__ = ["close_standard_output", "complain", "prepare_streams", "sentence", "write_to_standard_output"]
 
 
 def prepare_streams() -> None:
-    """Let σ, … and any file's name go to terminals that don't know them."""
+    """Let σ, … and any file's name go to terminals that don't know them, and a reader go away (``| head``).
+
+    Writing to nobody is an error then, as Python has it, and not the end of the process: some libraries
+    undo that.
+    """
+    if hasattr(signal, "SIGPIPE") and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGPIPE, signal.SIG_IGN)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
