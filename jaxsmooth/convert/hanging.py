@@ -185,7 +185,7 @@ class _Search:
         Others are of a part that touches the facet, or cuts through it, without being tied to it."""
         width = corners.shape[1]
         pairs = np.stack([np.repeat(node, width), corners.ravel()], axis=1)
-        tied = _in_one_element(pairs, blocks, len(self.points)).reshape(-1, width).any(axis=1)
+        tied = np.any(_in_one_element(pairs, blocks, len(self.points)).reshape(-1, width), axis=1)
         loose, firm = np.flatnonzero(~tied), np.flatnonzero(tied)
         while len(loose) and len(firm):
             one, other = np.nonzero(row[loose][:, None] == row[firm])

@@ -114,7 +114,7 @@ def _matched(
     chosen = []
     for facets in boundary:
         corners = facets.nodes[:, : facets.type.corners]
-        whole = (partner[facets.nodes] >= 0).all(axis=1)
+        whole = np.all(partner[facets.nodes] >= 0, axis=1)
         keys = facet_keys(np.concatenate([partner[corners[whole]], corners]), len(points))
         known = np.isin(keys[: whole.sum()], keys[whole.sum() :])
         whole[whole] = known & (partner[corners[whole]] != corners[whole]).any(axis=1)

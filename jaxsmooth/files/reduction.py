@@ -12,7 +12,6 @@ from jaxsmooth.convert.regions import (
     SECTIONS,
     find_regions,
     folded,
-    integers,
     recall,
     region_arrays,
 )
@@ -58,7 +57,7 @@ def add_materials(mesh: meshio.Mesh, holds: Holds, dim: int, notes: list[str]) -
     top = [k for k, cells in enumerate(mesh.cells) if cells.dim == dim]
     cells = [(c.type, c.data) for c in mesh.cells]
     name = material_name(mesh, dim)
-    tags = None if name is None else np.concatenate([integers(mesh.cell_data[name][k]) for k in top])
+    tags = None if name is None else np.concatenate(list(dict(region_arrays(mesh, top))[name].values()))
     if recall(mesh, SECTIONS) is None and tags is not None and (tags != tags[0]).any():
         return
     parts = dict(

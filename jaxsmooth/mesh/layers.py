@@ -115,7 +115,7 @@ def boundary_layers(mesh: Mesh, facets: Sequence[Facets] | None = None) -> tuple
     if not any(rows.any() for rows in upright):
         return tuple(upright)
     broken = _broken(blocks, points, count)
-    near = [broken[nodes].any(axis=1) for _, nodes in blocks]
+    near = [np.any(broken[nodes], axis=1) for _, nodes in blocks]
     parts = [_flat(*block, points, a | b) for block, a, b in zip(blocks, upright, near, strict=True)]
     row, sides, height = (np.concatenate(part) for part in zip(*parts, strict=True))
     block = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
@@ -147,7 +147,7 @@ def layer_nodes(mesh: Mesh, facets: Sequence[Facets] | None = None) -> np.ndarra
     if held.any():
         blocks = [(kind, np.asarray(nodes)) for kind, nodes in mesh.blocks]
         broken = _broken(blocks, np.asarray(mesh.points, np.float64), len(mesh.points))
-        held &= ~nodes_of(mesh, [broken[nodes].any(axis=1) for _, nodes in blocks])
+        held &= ~nodes_of(mesh, [np.any(broken[nodes], axis=1) for _, nodes in blocks])
     return held
 
 

@@ -287,7 +287,7 @@ def _limits(groups: _Groups, hanging: _Hanging, tangents: np.ndarray) -> tuple[n
     np.add.at(barred, hanging.parents[leads], np.repeat(own, leads.sum(axis=1), axis=0))
     allowed = np.tile(identity, (number, 1, 1))
     allowed[linked] = _null_space(barred[linked])
-    still = ~allowed.any(axis=(1, 2))
+    still = ~np.any(allowed, axis=(1, 2))
     still[hanging.groups] = (still[hanging.parents] | ~leads).all(axis=1)
     less = linked & (still | (_rank(allowed) < _rank(tangents[groups.leader])))
     bound = np.union1d(groups.leader[less], nodes[still[groups.of[nodes]]])

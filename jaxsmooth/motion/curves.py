@@ -158,7 +158,7 @@ def find_curves(
     pair = order[first[two][:, None] + [0, 1]]  # positions in `flat`: 2 segment + end
     leave = segments.leave.reshape(len(flat), -1)
     turn = _angle(leave[pair[:, 0]], -leave[pair[:, 1]])
-    on_line = straight[ends].any(axis=1)
+    on_line = np.any(straight[ends], axis=1)
     junction = on_line[pair // 2].sum(axis=1) == 1
     goes_on = (turn < np.deg2rad(corner_angle)) & ~straight[two]
     tangent, known = _tangents(segments, points, two[goes_on], pair[goes_on], on_line)

@@ -192,10 +192,7 @@ def _solve_jvp(primals, tangents):
 
     _, change = jax.jvp(residual, (system,), tangents[:1])
     matvec, _, solver = _equations(system, tolerance, max_iterations)
-    # JAX annotates no result
-    slope, _ = jax.lax.custom_linear_solve(  # pyright: ignore[reportGeneralTypeIssues]
-        matvec, change, solver, symmetric=True, has_aux=True
-    )
+    slope, _ = jax.lax.custom_linear_solve(matvec, change, solver, symmetric=True, has_aux=True)
     iterations: Any = np.zeros((), jax.dtypes.float0)  # the tangent of an integer is NumPy's
     return solution._replace(field=field), Solution(slope, iterations, jnp.zeros_like(solution.residual))
 

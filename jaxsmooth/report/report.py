@@ -89,7 +89,7 @@ _LOWERING = "/jax/core/compile/jaxpr_to_mlir_module_duration"
 def movable_elements(mesh: Mesh, constraints: Motion) -> tuple[np.ndarray, ...]:
     """Masks ``[elements]``, one a block, of the elements with a node that may move."""
     free = constraints.at(mesh.points).freedom > 0
-    return tuple(free[np.asarray(nodes)].any(axis=1) for nodes in mesh.connectivity)
+    return tuple(np.any(free[np.asarray(nodes)], axis=1) for nodes in mesh.connectivity)
 
 
 def summarise(mesh: Mesh, masks: tuple[np.ndarray, ...] | None = None) -> dict[str, float]:
