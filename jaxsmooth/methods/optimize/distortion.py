@@ -12,10 +12,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsmooth.cells.table import ElementType
+from jaxsmooth.metrics.record import Metric
 from jaxsmooth.metrics.shape import CORNER_WEIGHT, MEAN_RATIO, SHAPE_AND_CORNERS, excess, sample_gradients
 from jaxsmooth.numerics.small import cofactors, contract, determinant, power
 
@@ -30,9 +32,11 @@ __all__ = [
     "regularisation",
 ]
 
-METRICS = (SHAPE_AND_CORNERS.name, MEAN_RATIO.name)
+METRICS = (SHAPE_AND_CORNERS, MEAN_RATIO)
+"""Metrics with a regularised form and a Hessian model of their own."""
 _EPS, _EPS_SLOPE = 0.1, 0.2  # ε of a degenerate mesh, and its growth with the worst inversion
 _KEEP = 4.0  # size weight per ε of elements below their size
+_FLOOR = 1e-6  # least value of a metric of a user's own, over the ideal one
 
 Nodes = Float[Array, "k dim"]
 Scalar = Float[Array, ""] | float
@@ -41,7 +45,7 @@ Scalar = Float[Array, ""] | float
 def positive_part(det: Array, eps: Array | float) -> Array:
     """χ(det) = (det + √(det² + ε²)) / 2: positive everywhere, det itself for ε = 0 and det > 0.
 
-    With it a barrier is finite on inverted elements and drives them out as ε falls (Escobar,
+    With it a barrier is finite on inverted elements and check_metric them out as ε falls (Escobar,
     Rodríguez, Montenegro, Montero and González-Yuste 2003).
     """
     root = jnp.sqrt(det * det + eps * eps)
@@ -65,18 +69,18 @@ def _slope(det: Array, eps: Array | float) -> Array:
     return jnp.where(root > 0, (1 + det / jnp.where(root > 0, root, 1)) / 2, 0)
 
 
-def isoperimetric(kind: ElementType, metric: str) -> bool:
+def isoperimetric(kind: ElementType, metric: Metric) -> bool:
     """Whether the paper's q serves as the metric: where it is largest on the ideal element."""
-    return metric == SHAPE_AND_CORNERS.name and kind.ideal_is_optimum
+    return metric == SHAPE_AND_CORNERS and kind.ideal_is_optimum
 
 
-def _bounded(kind: ElementType, metric: str) -> bool:
+def _bounded(kind: ElementType, metric: Metric) -> bool:
     """Whether the paper's q only bounds the metric, which is the mean ratio: where some elements
     have less surface than the ideal one."""
-    return metric == SHAPE_AND_CORNERS.name and not isoperimetric(kind, metric)
+    return metric == SHAPE_AND_CORNERS and not isoperimetric(kind, metric)
 
 
-def _sampled(kind: ElementType, metric: str) -> bool:
+def _sampled(kind: ElementType, metric: Metric) -> bool:
     """Whether the metric looks at the Jacobian at sample points: where it varies, or alone counts."""
     return not isoperimetric(kind, metric) or not kind.constant_jacobian
 
@@ -133,7 +137,7 @@ class Samples(NamedTuple):
 
 
 def _samples(
-    kind: ElementType, metric: str, nodes: Nodes, size: Scalar, eps: Scalar
+    kind: ElementType, metric: Metric, nodes: Nodes, size: Scalar, eps: Scalar
 ) -> tuple[Float[Array, ""], Nodes, Samples]:
     """Mean over the sample points of ``|A|² / (d det(A)^(2/d))``, its gradient, and the samples."""
     dim = kind.dim
@@ -167,6 +171,34 @@ def _size_weight(size_weight: Scalar, eps: Scalar, stretch: Float[Array, ""]) ->
     return size_weight + jnp.where(stretch < 1, _KEEP * eps, 0)
 
 
+def check_metric(metric: Metric, kinds: tuple[ElementType, ...]) -> None:
+    """Raises `ValueError` unless a metric can be optimised on elements of these types."""
+    lacking = [kind.name for kind in kinds if not metric.applies_to(kind)]
+    reason = (
+        f"it is not for {lacking[0]} elements"
+        if lacking
+        else "it compares an element with others"
+        if metric.relative
+        else f"it has a unit of {metric.units}"
+        if metric.units in ("length", "measure")
+        else "neither larger nor smaller values are better"
+        if metric.larger_is_better is None
+        else "it has no derivative"
+        if not metric.differentiable
+        else None
+    )
+    if reason is not None:
+        raise ValueError(f"the metric {metric.name!r} can't be optimised: {reason}")
+
+
+def _inverse(kind: ElementType, metric: Metric, nodes: Nodes) -> Float[Array, ""]:
+    """Any metric as e: 1 on the ideal element, larger where worse."""
+    value, ideal = metric(kind, nodes), metric.ideal_value(kind)
+    if metric.larger_is_better:
+        return 1 / jnp.maximum(value / ideal, _FLOOR)
+    return value / ideal if ideal > 0 else 1 + value - ideal
+
+
 class _Metric(NamedTuple):
     """e, its gradient, and what the Hessian model needs."""
 
@@ -177,7 +209,7 @@ class _Metric(NamedTuple):
     samples: Samples | None
 
 
-def _metric(kind: ElementType, metric: str, size_weight, nodes: Nodes, size, eps) -> _Metric:
+def _metric(kind: ElementType, metric: Metric, size_weight, nodes: Nodes, size, eps) -> _Metric:
     dim = kind.dim
     volume = _volume(kind, nodes, size, eps)
     stretch = volume.value / size
@@ -185,7 +217,7 @@ def _metric(kind: ElementType, metric: str, size_weight, nodes: Nodes, size, eps
     value = size_weight * ((stretch + 1 / stretch) / 2 - 1)
     gradient = size_weight * (1 - 1 / stretch**2) / (2 * size) * volume.gradient
     surface = samples = None
-    if metric == SHAPE_AND_CORNERS.name:
+    if metric == SHAPE_AND_CORNERS:
         surface = _surface(kind, nodes)
         ratio = (surface.value / kind.ideal_surface) ** 2 / volume.value ** (2 * (dim - 1) / dim)
         slope = (
@@ -197,6 +229,10 @@ def _metric(kind: ElementType, metric: str, size_weight, nodes: Nodes, size, eps
         value, gradient = value + ratio, gradient + slope
     if _sampled(kind, metric):
         mean, slope, samples = _samples(kind, metric, nodes, size, eps)
+        if metric not in METRICS:  # the mean ratio lends its barrier and its Hessian model
+            plain = jnp.asarray(eps) <= 0
+            own = jax.value_and_grad(lambda nodes: _inverse(kind, metric, nodes))(nodes)
+            mean, slope = (jnp.where(plain, a, b) for a, b in zip(own, (mean, slope), strict=True))
         weight = CORNER_WEIGHT if isoperimetric(kind, metric) else 1.0
         value = value + (weight * (mean - 1) if isoperimetric(kind, metric) else mean)
         gradient = gradient + weight * slope
@@ -204,7 +240,7 @@ def _metric(kind: ElementType, metric: str, size_weight, nodes: Nodes, size, eps
 
 
 def inverse_quality(
-    kind: ElementType, metric: str, size_weight: Scalar, nodes: Nodes, size: Scalar, eps: Scalar
+    kind: ElementType, metric: Metric, size_weight: Scalar, nodes: Nodes, size: Scalar, eps: Scalar
 ) -> tuple[Float[Array, ""], Nodes]:
     """e ≥ 1 of one element, and its gradient ``[k, dim]``.
 
@@ -221,7 +257,8 @@ def inverse_quality(
 
     Args:
         kind: the element type.
-        metric: one of `METRICS`.
+        metric: one of `METRICS`, or any that passes `check_metric`: e is then its ideal value over it, or
+            where small is best it over its ideal (above an ideal of 0); the mean ratio while ε is positive.
         size_weight: of ``(τ + 1/τ)/2 − 1``, τ the measure over the target's; 0 leaves it free, but
             with ε elements below their size are kept from vanishing.
         nodes: ``[k, dim]``.
@@ -250,7 +287,7 @@ class Model(NamedTuple):
 
 def hessian_model(
     kind: ElementType,
-    metric: str,
+    metric: Metric,
     size_weight: Scalar,
     aggregate: Callable[[Array], tuple[Array, Array]],
     nodes: Nodes,

@@ -18,7 +18,7 @@ from jaxsmooth.guards.patch import PatchGuard
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.methods.base import Method, Proposal
 from jaxsmooth.methods.elastic.method import Elastic
-from jaxsmooth.methods.optimize.distortion import METRICS
+from jaxsmooth.methods.optimize.distortion import METRICS, check_metric
 from jaxsmooth.methods.optimize.goals import BALANCED, GOALS, UNTANGLE, Goal
 from jaxsmooth.methods.optimize.minimise import Minimiser, Newton
 from jaxsmooth.methods.optimize.problem import Aggregation, Problem, problem
@@ -26,6 +26,7 @@ from jaxsmooth.metrics.evaluation import Evaluation
 from jaxsmooth.metrics.record import Metric
 from jaxsmooth.metrics.shape import SHAPE_AND_CORNERS
 from jaxsmooth.metrics.summary import POOR
+from jaxsmooth.metrics.table import as_metric
 from jaxsmooth.motion.base import Motion
 from jaxsmooth.numerics.small import Frame
 from jaxsmooth.targets import FreeSize, OwnSize, Target
@@ -61,11 +62,10 @@ def _goal(value: Goal | str) -> Goal:
     return GOALS[value] if isinstance(value, str) else value
 
 
-def _metric(value: Metric | str) -> str:
-    name = value if isinstance(value, str) else value.name
-    if name not in METRICS:
-        raise ValueError(f"the metric must be one of {', '.join(METRICS)}; got {name!r}")
-    return name
+def _metric(value: Metric | str) -> Metric:
+    metric = as_metric(value)
+    check_metric(metric, ())
+    return metric
 
 
 class Optimize(Method):
@@ -74,7 +74,8 @@ class Optimize(Method):
     Attributes:
         goal: `AVERAGE`, `WORST` or `BALANCED`, or one of your own; a name of `GOALS` will do.
         metric: `SHAPE_AND_CORNERS`, the paper's q where its optimum is the ideal element, both for wedges,
-            pyramids and quadratic elements, or `MEAN_RATIO` for all (`metrics.shape`); their names will do.
+            pyramids and quadratic elements, `MEAN_RATIO` for all (`metrics.shape`), or any other that has a
+            derivative and no unit of length; names of `METRICS` will do.
         target: `FreeSize`, `OwnSize` (the paper's) or `GivenSize`.
         pivot: of n elements, ``pivot · √n`` count as poor: the value of the next is the pivot of
             the aggregation.
@@ -90,7 +91,7 @@ class Optimize(Method):
     """
 
     goal: Goal = eqx.field(static=True, converter=_goal, default=BALANCED)
-    metric: str = eqx.field(static=True, converter=_metric, default=SHAPE_AND_CORNERS)
+    metric: Metric = eqx.field(static=True, converter=_metric, default=SHAPE_AND_CORNERS)
     target: Target = FreeSize()
     pivot: Float[Array, ""] | float = 0.5
     minimiser: Minimiser = Newton()
@@ -102,9 +103,10 @@ class Optimize(Method):
 
     @property
     def acceptance(self) -> AcceptanceRule:
-        """A goal that knows the worst elements alone gives some of the average quality for them."""
+        """A goal that knows the worst elements alone, or another metric, is worth some average quality."""
         rule = super().acceptance
-        return rule if self.goal.averaged else replace(rule, average=math.inf)
+        kept = self.goal.averaged and self.metric in METRICS
+        return rule if kept else replace(rule, average=math.inf)
 
     def attempts(self, tangled: bool) -> tuple[Method, ...]:
         """The objective is trusted first, for it has a barrier of its own; then as for other methods."""

@@ -24,11 +24,14 @@ from jaxsmooth.mesh.execution import Execution
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.methods.optimize.distortion import (
     apply_model,
+    check_metric,
     hessian_model,
     inverse_quality,
     model_diagonal,
     regularisation,
 )
+from jaxsmooth.metrics.record import Metric
+from jaxsmooth.metrics.shape import SHAPE_AND_CORNERS
 from jaxsmooth.motion.base import Motion
 from jaxsmooth.numerics.admissible import Admissible
 from jaxsmooth.numerics.small import contract, determinant
@@ -107,7 +110,7 @@ class Problem(eqx.Module):
     aggregation: Aggregation
     size_weight: Float[Array, ""]
     kinds: tuple[ElementType, ...] = eqx.field(static=True)
-    metric: str = eqx.field(static=True)
+    metric: Metric = eqx.field(static=True)
 
     def _scan(self, function: Callable[..., Any], start: Any, points: Field) -> Any:
         """Carry `start` through all chunks: ``(carry, kind, chunk) -> carry``."""
@@ -285,7 +288,7 @@ def problem(
     motion: Motion,
     sizes: tuple[Float[Array, " _"], ...],
     aggregation: Aggregation,
-    metric: str = "shape_and_corners",
+    metric: Metric = SHAPE_AND_CORNERS,
     size_weight: Scalar = 0.0,
 ) -> Problem:
     """The objective of a mesh.
@@ -295,12 +298,15 @@ def problem(
         motion: what the nodes may do.
         sizes: measure of the target elements, one array a block; they also normalise the determinants.
         aggregation: φ.
-        metric: ``"shape_and_corners"`` or ``"mean_ratio"``.
+        metric: what e is the inverse of.
         size_weight: see `inverse_quality`.
+
+    Raises `ValueError` when the metric can't be optimised on the elements.
     """
     dtype = mesh.points.dtype
     free = movable(motion.at(mesh.points))
     kinds = tuple(kind for kind, _ in mesh.blocks)
+    check_metric(metric, kinds)
     counted = [gather(free, nodes).any(axis=1).astype(dtype) for _, nodes in mesh.blocks]
     total = jnp.concatenate(counted).sum()
     blocks = tuple(
