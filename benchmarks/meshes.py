@@ -1,11 +1,14 @@
 """Smooth every mesh file of a folder, from file to file, and print one row a run.
 
     python -m benchmarks.meshes FOLDER [--methods elastic,elastic-extended] [--steps 3]
-                                       [--boundary slide] [--precision float64] [--out TABLE.md]
+                                       [--boundary planar] [--precision float64] [--out TABLE.md]
 
 Every run reads the file, smooths it, writes it in its own format to a temporary folder, reads
-that again and checks that topology and data are those of the input and that no element is
-inverted that was not.  Surfaces in 3D are skipped.  Without a folder the demo mesh is used.
+that again and checks that topology and data are those of the input and that nothing is worse: no
+more inverted and no more poor elements, no lower q_min and scaled Jacobian than the input's (where
+these are below 0.2 and 0.1), no lower q_avg unless the method is the extended one or the mesh has
+become valid, and all nodes where the boundary lets them be.  What is broken is the row, and the exit
+status is 1.  Surfaces in 3D are skipped.  Without a folder the demo mesh is used.
 Qualities are over the elements with a node that may move, inverted elements over all.
 """
 
@@ -31,8 +34,9 @@ def main() -> int:
     parser.add_argument("folder", nargs="?", type=Path)
     parser.add_argument("--methods", default="elastic,elastic-extended")
     parser.add_argument("--steps", type=int, default=3)
-    parser.add_argument("--boundary", choices=("slide", "fixed"), default="slide")
+    parser.add_argument("--boundary", choices=("planar", "slide", "fixed"), default="planar")
     parser.add_argument("--precision", choices=("float64", "float32"), default="float64")
+    parser.add_argument("--largest", type=int, default=300_000, help="elements of a mesh, at most")
     parser.add_argument("--only", default="", help="part of the file name")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
@@ -49,7 +53,7 @@ def main() -> int:
             continue
         for name in options.methods.split(","):
             try:
-                row = smooth_file(path, name, options.steps, options.boundary)
+                row = smooth_file(path, name, options)
             except ValueError as error:
                 row = None if "surface" in str(error) else f"| {path.name} | {name} | error: {error} |"
                 failures += row is not None
@@ -62,8 +66,8 @@ def main() -> int:
     return 1 if failures else 0
 
 
-def smooth_file(path: Path, name: str, steps: int, boundary: str) -> str:
-    """One row of the table.  Raises `ValueError` where a promise is broken."""
+def smooth_file(path: Path, name: str, options: argparse.Namespace) -> str | None:
+    """One row of the table, or none for too large a mesh.  Raises `ValueError` where a promise is broken."""
     from jaxsmooth.files.io import read, write
     from jaxsmooth.methods import METHODS
     from jaxsmooth.metrics.validity import inverted
@@ -72,14 +76,18 @@ def smooth_file(path: Path, name: str, steps: int, boundary: str) -> str:
     from jaxsmooth.runs.driver import smooth
 
     file = read(path)
+    if sum(map(len, file.mesh.connectivity)) > options.largest:
+        return None
     start = time.perf_counter()
-    constraints = detect_constraints(file.mesh, boundary=boundary)
-    result = smooth(file, METHODS[name](), steps=steps, constraints=constraints, tolerance_avg=0.0)
+    constraints = detect_constraints(file.mesh, boundary=options.boundary)
+    result = smooth(file, METHODS[name](), steps=options.steps, constraints=constraints, tolerance_avg=0.0)
     seconds = time.perf_counter() - start
     warm = [row.seconds for row in result.history[2:]]
     before, after = (np.concatenate([~part for part in inverted(mesh)]) for mesh in (file.mesh, result.mesh))
-    if name not in ("laplacian", "weighted-laplacian") and (before & ~after).any():
-        raise ValueError(f"{int((before & ~after).sum())} elements inverted that were not")
+    if name not in ("laplacian", "weighted-laplacian"):
+        not_worse(file.mesh, result.mesh, name)
+    if options.boundary != "slide":
+        kept(constraints, file.mesh.points, result.mesh.points)
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / path.name
         write(target, file, result)
@@ -102,6 +110,37 @@ def smooth_file(path: Path, name: str, steps: int, boundary: str) -> str:
         f"| {(~before).sum()} → {(~after).sum()} "
         f"| {np.mean(warm) if warm else seconds:.3f} | {result.status} |"
     )
+
+
+def not_worse(first, last, name: str) -> None:
+    """Raise `ValueError` where a mesh is worse than it was."""
+    from jaxsmooth.metrics.summary import POOR, statistics
+
+    before, after = statistics(first), statistics(last)
+    rounding = 1e-9 if first.points.dtype == np.float64 else 1e-5
+    freed = name == "elastic-extended" or before.inverted > after.inverted == 0
+    limits = {
+        "inverted": (-after.inverted, -before.inverted),
+        "poor": (-after.below, -before.below),
+        "q_min": (after.q_min, min(before.q_min, POOR)),
+        "scaled Jacobian": (after.scaled_jacobian_min, min(before.scaled_jacobian_min, 0.1)),
+        "q_avg": (after.q_avg, -1 if freed else before.q_avg),
+    }
+    worse = [
+        f"{key} {abs(low)} → {abs(value)}"
+        for key, (value, low) in limits.items()
+        if not value >= low - rounding
+    ]
+    if worse:
+        raise ValueError(f"worse: {', '.join(worse)}")
+
+
+def kept(constraints, first, last) -> None:
+    """Raise `ValueError` where nodes are where the boundary does not let them be."""
+    move = last - first
+    away = np.abs(np.asarray(move - constraints.at(first).project(move))).max() / np.ptp(first, axis=0).max()
+    if away > (1e-9 if first.dtype == np.float64 else 1e-5):
+        raise ValueError(f"a node left the boundary by {away:.1e} of the domain")
 
 
 def same_file(file, again) -> None:
