@@ -85,6 +85,8 @@ def _check_input(options: argparse.Namespace) -> None:
 
 
 def _set_up_jax(options: argparse.Namespace) -> None:
+    # XLA reports processor features of kept programs as errors; it reads this when it is loaded
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     import jax
 
     from jaxsmooth.cache import keep_compiled
