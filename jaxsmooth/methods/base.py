@@ -16,6 +16,7 @@ from jaxsmooth.guards.patch import PatchGuard
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.metrics.evaluation import Evaluation, evaluate
 from jaxsmooth.motion.base import Motion
+from jaxsmooth.numerics.small import in_precision
 
 __all__ = ["Method", "Proposal", "Step"]
 
@@ -99,11 +100,12 @@ class Method(eqx.Module):
 
     def step(self, mesh: Mesh, motion: Motion, before: Evaluation, state: Any = None) -> Step:
         """Propose and guard: pure, jittable and differentiable in points and parameters."""
-        proposal = self.propose(mesh, motion, before, state)
-        if self.guard is None:
+        method, motion = in_precision((self, motion), mesh.points.dtype)
+        proposal = method.propose(mesh, motion, before, state)
+        if method.guard is None:
             points = motion.retract(mesh.points, proposal.move)
             after = evaluate(mesh.with_points(points))
             shortened = jnp.int32(0)
         else:
-            points, after, shortened, _ = self.guard(mesh, motion, proposal.move, before)
+            points, after, shortened, _ = method.guard(mesh, motion, proposal.move, before)
         return Step(points, after, proposal.iterations, proposal.residual, shortened)

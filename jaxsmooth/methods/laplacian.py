@@ -8,6 +8,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsmooth.assembly import gather, scatter_add
@@ -46,9 +47,19 @@ class Laplacian(Method):
     def __post_init__(self):
         self.guard = SmartGuard() if self.smart else None
 
-    def init(self, mesh: Mesh) -> Int[Array, "pairs 2"] | None:
-        """The connected nodes, every pair once: elements share edges, and Eq. 37 counts a neighbour once."""
-        return None if self.weighted else jnp.asarray(node_pairs(mesh), jnp.int32)
+    def init(self, mesh: Mesh) -> Int[Array, "*batch pairs 2"] | None:
+        """The connected nodes, every pair once: elements share edges, and Eq. 37 counts a neighbour once.
+
+        Those of a `Batch` are filled up by its last node, which is a ghost, with itself.
+        """
+        if self.weighted:
+            return None
+        if mesh.connectivity[0].ndim == 2:
+            return jnp.asarray(node_pairs(mesh), jnp.int32)
+        each = [node_pairs(jax.tree.map(lambda leaf, i=i: leaf[i], mesh)) for i in range(len(mesh.points))]
+        most, last = max(map(len, each)), mesh.points.shape[1] - 1
+        filled = [np.pad(p, ((0, most - len(p)), (0, 0)), constant_values=last) for p in each]
+        return jnp.asarray(np.stack(filled), jnp.int32)
 
     def propose(self, mesh: Mesh, motion: Motion, before: Evaluation, state: Any = None) -> Proposal:
         """The displacement of Eq. 37 or 38, projected onto the free directions of each node."""

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jaxsmooth.cells.table import ElementType
 from jaxsmooth.metrics.geometry import divide, edge_lengths, greatest
 from jaxsmooth.metrics.record import Metric
-from jaxsmooth.numerics.small import contract, determinant, least, norm, power
+from jaxsmooth.numerics.small import contract, determinant, least, norm, signed_power
 
 __all__ = [
     "CORNER_WEIGHT",
@@ -61,16 +61,16 @@ def shape_quality(kind: ElementType, nodes: Nodes, beta: Scalar | float = 2.0) -
     """The paper's metric, Eqs. 1–5, times the sign of the measure.
 
     ``q = 1 − |1 − (m_r / m)^β|`` with m the perimeter or surface area and m_r that of the
-    ideal element of the same measure.  Its gradient is finite for flat elements when
-    ``β ≥ dim / (dim − 1)``, which holds for the default.
+    ideal element of the same measure.  For flat elements its gradient is finite when
+    ``β ≥ dim / (dim − 1)``, which holds for the default, and not zero in 2D; for a smaller β it is 0 there.
     """
     volume, side = measure(kind, nodes), surface(kind, nodes)
     dim = kind.dim
-    # (m_r / m)^β with the roots of the measure collected into one power
-    top = kind.ideal_surface**beta * power(jnp.abs(volume), beta * (dim - 1) / dim)
+    # (m_r / m)^β with the roots of the measure collected into one power, and its sign
+    top = kind.ideal_surface**beta * signed_power(volume, beta * (dim - 1) / dim)
     solid = side > 0
     ratio = jnp.where(solid, top / jnp.where(solid, side, 1) ** beta, 0)
-    return jnp.sign(volume) * jnp.where(ratio > 1, 2 - ratio, ratio)
+    return jnp.where(jnp.abs(ratio) > 1, 2 * jnp.sign(ratio) - ratio, ratio)
 
 
 def min_jacobian(kind: ElementType, nodes: Nodes) -> Scalar:

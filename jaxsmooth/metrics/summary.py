@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxsmooth.assembly import gather
@@ -69,8 +70,17 @@ def _summary(mesh: Mesh, evaluation: Evaluation, threshold: float) -> tuple[Arra
 
 
 def statistics(mesh: Any, evaluation: Evaluation | None = None, threshold: float = POOR) -> Statistics:
-    """Statistics of a mesh; an `evaluation` that is already known saves time."""
+    """Statistics of a mesh; an `evaluation` that is already known saves time.
+
+    Raises:
+        TypeError: for points that JAX traces; use `quality` or `quality_mean`.
+    """
     mesh = as_mesh(mesh).bare
+    if isinstance(mesh.points, Tracer):
+        raise TypeError(
+            "statistics are numbers on the host, so JAX can't trace them; inside jit, grad or vmap use "
+            "quality(mesh) or quality_mean(mesh)"
+        )
     evaluation = evaluated(mesh) if evaluation is None else evaluation
     *values, below = (value.item() for value in jax.device_get(_summary(mesh, evaluation, threshold)))
     tangled = sum(int(part.sum()) for part in inverted(mesh, evaluation.jacobian))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 __all__ = [
@@ -13,9 +14,11 @@ __all__ = [
     "cofactors",
     "contract",
     "determinant",
+    "in_precision",
     "least",
     "norm",
     "power",
+    "signed_power",
     "solve_regular",
 ]
 
@@ -59,6 +62,27 @@ def power(base: Float[Array, ...], exponent: Float[Array, ""] | float) -> Float[
     return jnp.where(positive, jnp.where(positive, base, 1) ** exponent, 0)
 
 
+def signed_power(base: Float[Array, ...], exponent: Float[Array, ""] | float) -> Float[Array, ...]:
+    """``sign(base) |base| ** exponent``: at zero its derivative is 1 for exponent 1, else 0."""
+    return _signed_power(base, jnp.asarray(exponent, base.dtype))
+
+
+@jax.custom_jvp
+def _signed_power(base: Float[Array, ...], exponent: Float[Array, ""]) -> Float[Array, ...]:
+    return jnp.sign(base) * power(jnp.abs(base), exponent)
+
+
+@_signed_power.defjvp
+def _signed_power_jvp(primals, tangents):
+    (base, exponent), (change, growth) = primals, tangents
+    value = _signed_power(base, exponent)
+    solid = base != 0
+    size = jnp.abs(jnp.where(solid, base, 1))
+    flat = jnp.where(exponent == 1, 1, 0).astype(base.dtype)
+    slope = exponent * jnp.where(solid, size ** (exponent - 1), flat)
+    return value, slope * change + value * jnp.log(size) * growth
+
+
 @jax.custom_jvp
 def least(values: Float[Array, " n"]) -> Float[Array, ""]:
     """The minimum; its derivative is that of one of the least values.
@@ -81,6 +105,16 @@ def solve_regular(a: Float[Array, "dim dim"], b: Float[Array, " dim"], floor: fl
     det, scale = determinant(a), jnp.trace(a)
     regular = det > floor * scale ** a.shape[-1]
     return jnp.where(regular, cofactors(a).T @ b / jnp.where(regular, det, 1), 0)
+
+
+def in_precision(tree: Any, dtype: Any) -> Any:
+    """A pytree with all arrays of floats in the type of the mesh that they are used with."""
+
+    def cast(leaf):
+        known = isinstance(leaf, (jax.Array, np.ndarray)) and jnp.issubdtype(leaf.dtype, jnp.floating)
+        return jnp.asarray(leaf, dtype) if known and leaf.dtype != dtype else leaf
+
+    return jax.tree.map(cast, tree)
 
 
 class Frame(NamedTuple):

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import reduce
+from functools import partial, reduce
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -14,9 +15,14 @@ from jaxtyping import Array, Bool, Float
 from jaxsmooth.cells.table import element_type
 from jaxsmooth.convert.meshfile import as_mesh
 from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.methods import Elastic, Method
+from jaxsmooth.metrics.record import Metric
+from jaxsmooth.metrics.shape import SHAPE
+from jaxsmooth.metrics.table import as_metric, quality
 from jaxsmooth.motion.base import Motion
 from jaxsmooth.motion.detect import detect_constraints
 from jaxsmooth.motion.planar import Constraints
+from jaxsmooth.runs.pure import Run, method_state, run
 
 __all__ = ["Batch", "stack"]
 
@@ -49,6 +55,29 @@ class Batch(eqx.Module):
         """Mean over the real elements of each mesh, of values given block by block."""
         sums = [jnp.where(m, v, 0).sum(axis=1) for m, v in zip(self.elements, values, strict=True)]
         return reduce(jnp.add, sums) / reduce(jnp.add, [m.sum(axis=1) for m in self.elements])
+
+    def quality_mean(self, mesh: Mesh | None = None, metric: Metric | str = SHAPE) -> Float[Array, " batch"]:
+        """Mean of a metric over the real elements that have it, of each mesh of `mesh` or of the batch."""
+        mesh, metric = self.mesh if mesh is None else mesh, as_metric(metric)
+        kinds = [element_type(name) for name in mesh.types]
+        values = jax.vmap(partial(quality, metric=metric))(mesh)
+        known = [metric.applies_to(kind) & mask for kind, mask in zip(kinds, self.elements, strict=True)]
+        sums = [jnp.where(m, v, 0).sum(axis=1) for m, v in zip(known, values, strict=True)]
+        return reduce(jnp.add, sums) / reduce(jnp.add, [m.sum(axis=1) for m in known])
+
+    def run(self, method: Method | None = None, *, steps: int = 3, state: Any = None) -> Run:
+        """`run` for all meshes at once, by any method: a `Run` with a batch axis on every leaf.
+
+        `state` is what ``method.init(batch.mesh)`` has made, for methods that need it, where the connectivity
+        is traced.
+        """
+        method = Elastic() if method is None else method
+        state = method_state(method, self.mesh) if state is None else state
+
+        def one(mesh, constraints, state):
+            return run(mesh, method, constraints=constraints, steps=steps, state=state)
+
+        return jax.vmap(one)(self.mesh, self.constraints, state)
 
 
 def stack(meshes: Sequence[Any], constraints: Sequence[Motion] | None = None) -> Batch:

@@ -12,15 +12,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsmooth.convert.meshfile import as_mesh
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.methods import Elastic, Method
 from jaxsmooth.metrics.evaluation import Evaluation, evaluate
 from jaxsmooth.motion.base import Motion
+from jaxsmooth.numerics.implicit import attach_root, conjugate_residuals
+from jaxsmooth.numerics.small import in_precision
+from jaxsmooth.numerics.solve import gradient_tolerance
 
-__all__ = ["FixedPoint", "Run", "fixed_point", "run", "step"]
+__all__ = ["FixedPoint", "Run", "fixed_point", "method_state", "run", "step"]
 
 Field = Float[Array, "nodes dim"]
 _UNNESTED = 16  # steps whose points alone are kept; more are nested, for memory ~ √steps
@@ -34,7 +37,7 @@ def step(mesh: Any, method: Method, constraints: Motion, state: Any = None) -> M
     where the connectivity is not traced.
     """
     mesh = as_mesh(mesh)
-    state = _state(method, mesh) if state is None else state
+    state = method_state(method, mesh) if state is None else state
     return mesh.with_points(method.step(mesh, constraints, _before(mesh), state).points)
 
 
@@ -42,7 +45,7 @@ def _before(mesh: Mesh) -> Evaluation:
     return jax.lax.stop_gradient(evaluate(mesh))
 
 
-def _state(method: Method, mesh: Mesh) -> Any:
+def method_state(method: Method, mesh: Mesh) -> Any:
     """The state of the method, where the connectivity is known on the host."""
     traced = any(isinstance(nodes, Tracer) for nodes in mesh.connectivity)
     return None if traced else method.init(mesh)
@@ -100,7 +103,7 @@ def run(
     """
     mesh = as_mesh(mesh)
     method = Elastic() if method is None else method
-    state = _state(method, mesh) if state is None else state
+    state = method_state(method, mesh) if state is None else state
     saved = jax.checkpoint_policies.save_only_these_names("displacement", "accepted")
     dtype = mesh.points.dtype
     nothing = jnp.zeros((), dtype), jnp.int32(0), jnp.int32(0)
@@ -141,11 +144,18 @@ class FixedPoint(eqx.Module):
         mesh: the mesh that a further step leaves where it is.
         steps: steps taken.
         change: largest move of the last step, relative to the size of the domain.
+        converged: whether that is within the tolerance; if not, the derivative is that of nothing.
     """
 
     mesh: Mesh
     steps: Int[Array, ""]
     change: Float[Array, ""]
+    converged: Bool[Array, ""]
+
+    @property
+    def points(self) -> Field:
+        """The points of the converged mesh."""
+        return self.mesh.points
 
 
 def fixed_point(
@@ -153,29 +163,34 @@ def fixed_point(
     method: Method | None = None,
     *,
     constraints: Motion,
-    tolerance: float = 1e-9,
+    tolerance: float | None = None,
     max_steps: int = 200,
+    max_iterations: int = 500,
 ) -> FixedPoint:
     """Repeat unguarded steps until the mesh stays where it is, with an implicit derivative.
 
     With z the points that are held and u the free displacements, the mesh solves
-    ``u = G(u, z) = P (step(z + P u) − z)``.  Its derivative is ``(I − G_u)⁻¹ G_z``, found by
-    repeating the linearised step until it converges: one iteration for any number of steps,
-    and no dependence on where the free nodes started.
+    ``u = G(u, z) = P (step(z + P u) − z)``.  Its derivative is ``(I − G_u)⁻¹ G_z``, found by conjugate
+    residuals with the linearised step: one solution for any number of steps, and no dependence on where the
+    free nodes started.  Derivatives of every order are right.
 
     Args:
         mesh: the start, a mesh as for `run`; near enough to a valid mesh that no guard is needed.
         method: `Elastic()` by default; solved tightly throughout.
         constraints: how nodes may move.
-        tolerance: on the largest move, relative to the size of the domain.
-        max_steps: bound on steps, and on the iterations of the derivative.
+        tolerance: on the largest move, relative to the size of the domain, and on the relative residual of
+            the derivative; 1e-9 by default, 7e-5 in float32.
+        max_steps: bound on steps.
+        max_iterations: bound on the iterations of the derivative.  A derivative that is not found is NaN.
 
     Returns:
-        The mesh, the number of steps and the last change: compare it with `tolerance`.
+        The mesh, the number of steps, the last change, and whether it is within the tolerance.
     """
     mesh = as_mesh(mesh)
     method = Elastic() if method is None else method
-    state = _state(method, mesh)
+    method, constraints = in_precision((method, constraints), mesh.points.dtype)
+    tolerance = max(1e-9, gradient_tolerance(mesh.points.dtype)) if tolerance is None else tolerance
+    state = method_state(method, mesh)
     bare = eqx.tree_at(lambda m: m.guard, method, None, is_leaf=lambda x: x is None)
     stopped = jax.lax.stop_gradient
     points = mesh.points
@@ -203,39 +218,12 @@ def fixed_point(
         return jax.lax.while_loop(unfinished, again, (u, jnp.asarray(jnp.inf, u.dtype), jnp.int32(0)))
 
     u, change, count = search(jnp.zeros_like(points))
-    u = _implicit(displaced, u, (bare, points, constraints), tolerance, max_steps)
-    return FixedPoint(mesh.with_points(place(u, points, constraints)), count, change)
 
+    def solve(matvec, right):
+        def solver(matvec, right):
+            return conjugate_residuals(matvec, right, tolerance, max_iterations)
 
-def _implicit(function, solution: Field, parameters, tolerance: float, max_steps: int) -> Field:
-    """`solution` of ``u = function(u, *parameters)`` with its derivative with respect to them."""
+        return jax.lax.custom_linear_solve(matvec, right, solver, solver)
 
-    @jax.custom_jvp
-    def attach(solution, parameters):
-        return solution
-
-    @attach.defjvp
-    def _(primals, tangents):
-        solution, parameters = primals
-        _, change = jax.jvp(lambda p: function(solution, *p), (parameters,), tangents[1:])
-        _, slope = jax.linearize(lambda u: function(u, *parameters), solution)
-
-        def iterate(matvec, right):
-            """Richardson iteration, which converges where the steps themselves do."""
-
-            def unfinished(state):
-                _, size, count = state
-                return (size > tolerance * jnp.abs(right).max()) & (count < max_steps)
-
-            def again(state):
-                x, _, count = state
-                residual = right - matvec(x)
-                return x + residual, jnp.abs(residual).max(), count + 1
-
-            start = (right, jnp.abs(right).max(), jnp.int32(0))
-            return jax.lax.while_loop(unfinished, again, start)[0]
-
-        tangent = jax.lax.custom_linear_solve(lambda v: v - slope(v), change, iterate, iterate)
-        return solution, tangent
-
-    return attach(jax.lax.stop_gradient(solution), parameters)
+    u = attach_root(lambda u, *p: u - displaced(u, *p), u, (bare, points, constraints), solve)
+    return FixedPoint(mesh.with_points(place(u, points, constraints)), count, change, change <= tolerance)

@@ -45,7 +45,7 @@ Scalar = Float[Array, ""] | float
 def positive_part(det: Array, eps: Array | float) -> Array:
     """χ(det) = (det + √(det² + ε²)) / 2: positive everywhere, det itself for ε = 0 and det > 0.
 
-    With it a barrier is finite on inverted elements and check_metric them out as ε falls (Escobar,
+    With it a barrier is finite on inverted elements and drives them out as ε falls (Escobar,
     Rodríguez, Montenegro, Montero and González-Yuste 2003).
     """
     root = jnp.sqrt(det * det + eps * eps)

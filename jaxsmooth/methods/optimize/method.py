@@ -28,6 +28,7 @@ from jaxsmooth.metrics.shape import SHAPE_AND_CORNERS
 from jaxsmooth.metrics.summary import POOR
 from jaxsmooth.metrics.table import as_metric
 from jaxsmooth.motion.base import Motion
+from jaxsmooth.numerics.implicit import undifferentiated
 from jaxsmooth.numerics.small import Frame
 from jaxsmooth.targets import FreeSize, OwnSize, Target
 
@@ -35,6 +36,10 @@ __all__ = ["Optimize"]
 
 _VALID = PatchGuard(gamma=0.0, poor=0.0, corner=0.0)  # only against inversion
 _PATIENCE = 4  # untangling stages without success
+_NO_DERIVATIVE = (
+    "Optimize has no derivative: it is several minimisations that are not carried to their ends; "
+    "use js.optimum, which solves for one optimum and differentiates that, or Elastic"
+)
 _SLACK = 1.0002  # a rise of the largest e that needs no repair
 
 
@@ -87,7 +92,8 @@ class Optimize(Method):
             earlier when several of them have not made the inverted elements fewer.
         guard: refuses moves that invert an element; `smooth` tries stricter ones where that is not enough.
 
-    A step is a whole optimisation; another one goes on from there.  It is not differentiable in reverse mode.
+    A step is a whole optimisation; another one goes on from there.  It has no derivative, and raises a
+    `TypeError` that names `js.optimum`, which has.
     """
 
     goal: Goal = eqx.field(static=True, converter=_goal, default=BALANCED)
@@ -118,7 +124,10 @@ class Optimize(Method):
 
     def propose(self, mesh: Mesh, motion: Motion, before: Evaluation, state: Any = None) -> Proposal:
         """The displacement to the optimised mesh."""
-        mesh, motion = jax.lax.stop_gradient((mesh, motion))
+        points, motion, method = undifferentiated((mesh.points, motion, self), _NO_DERIVATIVE)
+        return method._optimised(mesh.with_points(points), motion, before, state)
+
+    def _optimised(self, mesh: Mesh, motion: Motion, before: Evaluation, state: Any) -> Proposal:
         frame = Frame.of(mesh.points)
         mesh, motion = mesh.with_points(frame.into(mesh.points)), motion.within(frame)
         sizes = (self.target if self.target.sized else OwnSize()).measures(mesh, frame)  # units, if free
