@@ -15,9 +15,12 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 _HOMES = {
+    "adaptors": ("gmsh",),
+    "adaptors.pyvista": ("to_pyvista",),
+    "adaptors.skfem": ("to_skfem",),
     "cache": ("keep_compiled",),
     "cells.table": ("element_type",),
-    "convert.meshfile": ("MeshFile", "as_mesh", "from_meshio"),
+    "convert.meshfile": ("MeshFile", "as_mesh", "from_meshio", "to_meshio"),
     "convert.periodic": ("find_periodic",),
     "files.io": ("read", "write"),
     "guards.acceptance": ("AcceptanceRule", "Status"),
@@ -45,6 +48,7 @@ _HOMES = {
     "runs.pure": ("FixedPoint", "Run", "fixed_point", "run", "step"),
     "targets": ("FreeSize", "GivenSize", "OwnSize", "Target"),
 }
+_MODULES = {"gmsh"}  # names of modules
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = [
     "METHODS",
@@ -89,6 +93,7 @@ __all__ = [
     "find_periodic",
     "fixed_point",
     "from_meshio",
+    "gmsh",
     "host_nearest",
     "keep_compiled",
     "on_surface",
@@ -101,13 +106,19 @@ __all__ = [
     "statistics",
     "step",
     "stretched",
+    "to_meshio",
+    "to_pyvista",
+    "to_skfem",
     "write",
 ]
 
 if TYPE_CHECKING:
+    from jaxsmooth.adaptors import gmsh
+    from jaxsmooth.adaptors.pyvista import to_pyvista
+    from jaxsmooth.adaptors.skfem import to_skfem
     from jaxsmooth.cache import keep_compiled
     from jaxsmooth.cells.table import element_type
-    from jaxsmooth.convert.meshfile import MeshFile, as_mesh, from_meshio
+    from jaxsmooth.convert.meshfile import MeshFile, as_mesh, from_meshio, to_meshio
     from jaxsmooth.convert.periodic import find_periodic
     from jaxsmooth.files.io import read, write
     from jaxsmooth.guards.acceptance import AcceptanceRule, Status
@@ -139,7 +150,8 @@ if TYPE_CHECKING:
 def __getattr__(name: str):
     if name not in _HOME:
         raise AttributeError(f"module 'jaxsmooth' has no attribute {name!r}")
-    value = getattr(import_module(f"jaxsmooth.{_HOME[name]}"), name)
+    home = f"jaxsmooth.{_HOME[name]}"
+    value = import_module(f"{home}.{name}") if name in _MODULES else getattr(import_module(home), name)
     globals()[name] = value
     return value
 

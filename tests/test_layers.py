@@ -17,7 +17,7 @@ ORDER = (
         "targets",
         "methods",
     ),
-    *("runs", "files", "report", "demo", "cache", "options", "cli", "__main__"),
+    *("runs", "files", "adaptors", "report", "demo", "cache", "options", "cli", "__main__"),
 )
 LINES, FUNCTION = 400, 60
 

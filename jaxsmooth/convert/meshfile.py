@@ -27,13 +27,14 @@ from jaxsmooth.convert.checks import (
     tell_meshio,
 )
 from jaxsmooth.convert.coupling import find_coupled
+from jaxsmooth.convert.foreign import as_source
 from jaxsmooth.convert.labels import held_nodes, make_labels, make_named_sets, plain
 from jaxsmooth.convert.original import Original
 from jaxsmooth.convert.planes import Plane, find_plane
 from jaxsmooth.mesh.layers import STRETCHED, boundary_layers, stretched
 from jaxsmooth.mesh.record import Mesh
 
-__all__ = ["MeshFile", "MeshFileError", "as_mesh", "from_meshio", "to_meshio"]
+__all__ = ["MeshFile", "MeshFileError", "as_file", "as_mesh", "from_meshio", "to_meshio", "with_file"]
 
 
 @dataclass(frozen=True)
@@ -145,20 +146,20 @@ def from_meshio(
 
 
 def to_meshio(
-    file: MeshFile,
+    file: Any,
     points: Any = None,
     *,
     point_data: Mapping[str, Any] | None = None,
     cell_data: Mapping[str, Any] | None = None,
 ) -> meshio.Mesh:
-    """The file's mesh with other coordinates; all else is the source's, in the source's order.
+    """A `meshio.Mesh` with other coordinates; all else is the source's, in the source's order.
 
     Coordinates that are equal to those of `file.mesh` are written as they were read, so a float32 run
     leaves what it didn't move untouched; so are nodes outside of all elements, and what is normal to
     the plane of a plane mesh.
 
     Args:
-        file: what was read.
+        file: what was read, or what `smooth` returned, whose coordinates are taken then.
         points: new coordinates ``[nodes, dim]``; None for the old ones.
         point_data: more arrays ``{name: [nodes, …]}``.
         cell_data: more arrays, ``{name: {type: [elements, …]}}`` or a list with one array a block of
@@ -167,6 +168,9 @@ def to_meshio(
     Raises:
         ValueError: arrays whose shape doesn't fit the mesh.
     """
+    if not isinstance(file, MeshFile):
+        mesh, file = as_mesh(file), as_file(file)
+        points = mesh.points if points is None else points
     source = file.source
     out = copy.copy(source)
     for name in ("point_data", "cell_data", "point_sets", "cell_sets", "field_data"):
@@ -187,7 +191,7 @@ def to_meshio(
 
 def as_mesh(anything: Any) -> Mesh:
     """A `Mesh` from whatever is one or has one: `Mesh`, `MeshFile`, what `smooth` and `run` return,
-    `meshio.Mesh`, ``(points, {"tetra": nodes})``.
+    `meshio.Mesh`, PyVista's and VTK's grids, scikit-fem's meshes, ``(points, {"tetra": nodes})``.
 
     A `Mesh` comes back as it is, its points traced by JAX or not; all else is read as files are, so
     that reversed elements are turned, and nodes that belong together are linked.
@@ -195,18 +199,42 @@ def as_mesh(anything: Any) -> Mesh:
     Raises:
         ValueError: it is none of these, or not a mesh that can be smoothed.
     """
+    return with_file(anything)[0]
+
+
+def with_file(anything: Any) -> tuple[Mesh, MeshFile | None]:
+    """What `as_mesh` gives, and what is known beside it; None for a `Mesh` and what was made of one."""
     if isinstance(anything, Mesh):
-        return anything
+        return anything, None
     if isinstance(found := getattr(anything, "mesh", None), Mesh):
-        return found
-    if isinstance(anything, meshio.Mesh):
-        return from_meshio(anything).mesh
-    if isinstance(anything, (tuple, list)) and len(anything) == 2:
-        return from_meshio(_from_pair(*anything)).mesh
-    raise ValueError(
-        f"can't take {type(anything).__name__} for a mesh; give a Mesh, a MeshFile (read(path)), "
-        "a meshio.Mesh or (points, {'tetra': connectivity})"
-    )
+        known = anything if isinstance(anything, MeshFile) else getattr(anything, "file", None)
+        return found, known
+    source = as_source(anything)
+    if source is None and isinstance(anything, (tuple, list)) and len(anything) == 2:
+        source = _from_pair(*anything)
+    if source is None:
+        raise ValueError(
+            f"can't take {type(anything).__name__} for a mesh; give a Mesh, a MeshFile (read(path)), "
+            "a meshio.Mesh, a grid of PyVista, a mesh of scikit-fem or (points, {'tetra': connectivity})"
+        )
+    file = from_meshio(source)
+    return file.mesh, file
+
+
+def as_file(anything: Any) -> MeshFile:
+    """A `MeshFile` from whatever `as_mesh` takes; of a bare `Mesh` the regions are its only data."""
+    mesh, file = with_file(anything)
+    return _bare_file(mesh) if file is None else file
+
+
+def _bare_file(mesh: Mesh) -> MeshFile:
+    blocks = [(name, np.asarray(nodes)) for name, nodes in zip(mesh.types, mesh.connectivity, strict=True)]
+    source = meshio.Mesh(np.asarray(mesh.points), blocks)
+    if mesh.labels is not None and len({int(r) for part in mesh.labels.regions for r in np.unique(part)}) > 1:
+        source.cell_data["region"] = list(mesh.labels.regions)
+    rows = tuple((b, np.arange(len(nodes))) for b, (_, nodes) in enumerate(blocks))
+    fixed = np.zeros(len(source.points), bool)
+    return MeshFile(mesh, source, None, None, (), fixed, {}, rows)
 
 
 # --- From the source ---------------------------------------------------------------------

@@ -11,7 +11,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from jaxsmooth.convert.meshfile import MeshFile, MeshFileError, from_meshio, to_meshio
+from jaxsmooth.convert.meshfile import MeshFile, MeshFileError, as_file, as_mesh, from_meshio, to_meshio
 from jaxsmooth.convert.original import Original
 from jaxsmooth.files.formats.record import Patched, UnpatchableError, stem_format
 from jaxsmooth.files.formats.table import format_of_suffix
@@ -61,7 +61,7 @@ def read(path: str | Path, *, dtype: Any = None) -> MeshFile:
 
 def write(
     path: str | Path,
-    file: MeshFile,
+    file: Any,
     points: Any = None,
     *,
     file_format: str | None = None,
@@ -69,7 +69,7 @@ def write(
     cell_data: Mapping[str, Any] | None = None,
     point_data: Mapping[str, Any] | None = None,
 ) -> tuple[str, ...]:
-    """Write a file that was read, with other coordinates.
+    """Write a file that was read, with other coordinates; or any mesh, and what `smooth` returned.
 
     In the format of the input the output is the input, byte for byte, with other coordinates in it, so that
     also what this package knows nothing of is kept.  A note says where that is not possible; it is not
@@ -80,7 +80,8 @@ def write(
 
     Args:
         path: where to.  A name of the input's format keeps its version; others choose the format.
-        file: what was read; its data, sets and cells are written in their own order.
+        file: what was read; its data, sets and cells are written in their own order.  Or what `smooth`
+            returned, or whatever else `as_mesh` takes.
         points: coordinates ``[nodes, dim]``, or what has them as ``.mesh.points`` (the result of
             smoothing) or ``.points`` (a mesh); None for those of the file.
         file_format: overrules the name: ``"gmsh"`` (4.1), ``"gmsh22"``, ``"vtk"``, ``"vtu"``, …, followed by
@@ -109,7 +110,7 @@ def write(
 def write_to(
     outputs: Outputs,
     path: str | Path,
-    file: MeshFile,
+    file: Any,
     points: Any = None,
     *,
     file_format: str | None = None,
@@ -119,6 +120,9 @@ def write_to(
 ) -> tuple[str, ...]:
     """`write` as one of several outputs: the file is put in place when they are committed."""
     path = Path(path)
+    if not isinstance(file, MeshFile):
+        mesh, file = as_mesh(file), as_file(file)
+        points = mesh if points is None else points
     check_output(path, file.path, force)
     if file.path is not None:
         outputs.protect(file.path)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxsmooth.convert.meshfile import as_mesh
+from jaxsmooth.convert.meshfile import MeshFile, with_file
 from jaxsmooth.guards.acceptance import AcceptanceRule, Status
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.methods import Elastic, Method
@@ -57,6 +57,7 @@ class SmoothResult:
         history: a `StepRecord` for the input and for every step.
         status: why the run ended.
         constraints: the constraints that were used.
+        file: what was known beside the input's mesh: data, sets, where it comes from; None for a bare `Mesh`.
     """
 
     mesh: Mesh
@@ -64,6 +65,7 @@ class SmoothResult:
     history: tuple[StepRecord, ...]
     status: Status
     constraints: Motion
+    file: MeshFile | None = field(default=None, repr=False)
 
     @property
     def quality(self) -> tuple[Float[Array, " _"], ...]:
@@ -90,7 +92,7 @@ def smooth(
     """Improve a mesh by moving its nodes (Algorithm 1).
 
     Args:
-        mesh: a `Mesh`, a `MeshFile`, a `meshio.Mesh`, or ``(points, {"tetra": connectivity})``.
+        mesh: a `Mesh`, a `MeshFile`, a PyVista grid, or whatever else `as_mesh` takes.
         method: how a step is made; `Elastic()`, the paper's standard method, by default.
         steps: the largest number of steps.
         constraints: how nodes may move; by default `detect_constraints(mesh)`.
@@ -110,7 +112,7 @@ def smooth(
         ValueError: for an invalid mesh, or constraints that do not fit it.
         TypeError: for points that JAX traces; use `run`.
     """
-    mesh = as_mesh(mesh)
+    mesh, file = with_file(mesh)
     if isinstance(mesh.points, Tracer):
         raise TypeError(
             "smooth decides on the host when to stop, so JAX can't trace it; inside jit, grad or vmap use "
@@ -132,7 +134,7 @@ def smooth(
     status = driver.run(steps)
     end, history = driver.reached, tuple(driver.history)
     remember(end.mesh, end.evaluation)
-    return SmoothResult(end.mesh.with_labels(labels), end.evaluation, history, status, constraints)
+    return SmoothResult(end.mesh.with_labels(labels), end.evaluation, history, status, constraints, file)
 
 
 _PATIENCE = 3  # steps without change after which a mesh is taken to stay tangled

@@ -1,0 +1,1 @@
+"""Meshes to and from other libraries, each imported where it is used."""
