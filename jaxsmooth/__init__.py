@@ -31,8 +31,10 @@ _HOMES = {
     "mesh.record": ("Labels", "Mesh"),
     "methods": ("METHODS", "Elastic", "Laplacian", "Method", "Optimize"),
     "methods.elastic.elasticity": ("Material",),
+    "methods.optimize.energy": ("Energy", "energy"),
     "methods.optimize.goals": ("Goal", "Stage"),
     "methods.optimize.minimise": ("Minimiser",),
+    "methods.optimize.problem": ("Aggregation",),
     "metrics.evaluation": ("Evaluation", "evaluate"),
     "metrics.record": ("Metric",),
     "metrics.summary": ("Statistics", "statistics"),
@@ -41,11 +43,13 @@ _HOMES = {
     "motion.coupled": ("Coupled", "couple"),
     "motion.curved": ("Sliding",),
     "motion.detect": ("detect_constraints",),
+    "motion.following": ("Following", "follow"),
     "motion.given": ("host_nearest", "on_surface"),
     "motion.planar": ("Constraints",),
     "runs.batch": ("Batch", "stack"),
     "runs.driver": ("SmoothResult", "smooth"),
-    "runs.pure": ("FixedPoint", "Run", "fixed_point", "run", "step"),
+    "runs.optimum": ("Optimum", "optimum"),
+    "runs.pure": ("FixedPoint", "Run", "fixed_point", "if_valid", "run", "step"),
     "targets": ("FreeSize", "GivenSize", "OwnSize", "Target"),
 }
 _MODULES = {"gmsh"}  # names of modules
@@ -54,12 +58,15 @@ __all__ = [
     "METHODS",
     "METRICS",
     "AcceptanceRule",
+    "Aggregation",
     "Batch",
     "Constraints",
     "Coupled",
     "Elastic",
+    "Energy",
     "Evaluation",
     "FixedPoint",
+    "Following",
     "FreeSize",
     "GivenSize",
     "Goal",
@@ -75,6 +82,7 @@ __all__ = [
     "Motion",
     "NodeLinks",
     "Optimize",
+    "Optimum",
     "OwnSize",
     "PatchGuard",
     "Run",
@@ -89,14 +97,18 @@ __all__ = [
     "couple",
     "detect_constraints",
     "element_type",
+    "energy",
     "evaluate",
     "find_periodic",
     "fixed_point",
+    "follow",
     "from_meshio",
     "gmsh",
     "host_nearest",
+    "if_valid",
     "keep_compiled",
     "on_surface",
+    "optimum",
     "quality",
     "quality_mean",
     "read",
@@ -129,8 +141,10 @@ if TYPE_CHECKING:
     from jaxsmooth.mesh.record import Labels, Mesh
     from jaxsmooth.methods import METHODS, Elastic, Laplacian, Method, Optimize
     from jaxsmooth.methods.elastic.elasticity import Material
+    from jaxsmooth.methods.optimize.energy import Energy, energy
     from jaxsmooth.methods.optimize.goals import Goal, Stage
     from jaxsmooth.methods.optimize.minimise import Minimiser
+    from jaxsmooth.methods.optimize.problem import Aggregation
     from jaxsmooth.metrics.evaluation import Evaluation, evaluate
     from jaxsmooth.metrics.record import Metric
     from jaxsmooth.metrics.summary import Statistics, statistics
@@ -139,11 +153,13 @@ if TYPE_CHECKING:
     from jaxsmooth.motion.coupled import Coupled, couple
     from jaxsmooth.motion.curved import Sliding
     from jaxsmooth.motion.detect import detect_constraints
+    from jaxsmooth.motion.following import Following, follow
     from jaxsmooth.motion.given import host_nearest, on_surface
     from jaxsmooth.motion.planar import Constraints
     from jaxsmooth.runs.batch import Batch, stack
     from jaxsmooth.runs.driver import SmoothResult, smooth
-    from jaxsmooth.runs.pure import FixedPoint, Run, fixed_point, run, step
+    from jaxsmooth.runs.optimum import Optimum, optimum
+    from jaxsmooth.runs.pure import FixedPoint, Run, fixed_point, if_valid, run, step
     from jaxsmooth.targets import FreeSize, GivenSize, OwnSize, Target
 
 

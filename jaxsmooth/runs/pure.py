@@ -23,7 +23,7 @@ from jaxsmooth.numerics.implicit import attach_root, conjugate_residuals
 from jaxsmooth.numerics.small import in_precision
 from jaxsmooth.numerics.solve import gradient_tolerance
 
-__all__ = ["FixedPoint", "Run", "fixed_point", "method_state", "run", "step"]
+__all__ = ["FixedPoint", "Run", "fixed_point", "if_valid", "method_state", "run", "step"]
 
 Field = Float[Array, "nodes dim"]
 _UNNESTED = 16  # steps whose points alone are kept; more are nested, for memory ~ √steps
@@ -135,6 +135,20 @@ def run(
     least = jnp.stack([part.min() for part in evaluation.jacobian]).min()
     residuals, iterations, shortened = counts
     return Run(mesh, evaluation, residuals, iterations, shortened, least)
+
+
+def if_valid(value: Float[Array, ""], mesh: Any) -> Float[Array, ""]:
+    """A number where a mesh is valid, else ∞: what a line search has to see.
+
+    A trial step of an optimiser may tangle the mesh, and an energy of it then falls without bound: return
+    ``if_valid(objective, done)`` of what `run` has returned, and use a line search that takes ∞ for worse.
+    Its derivative where it is ∞ means nothing.
+    """
+    if isinstance(mesh, Run):
+        least = mesh.least
+    else:
+        least = jnp.stack([part.min() for part in _before(as_mesh(mesh)).jacobian]).min()
+    return jnp.where(jax.lax.stop_gradient(least) > 0, value, jnp.inf)
 
 
 class FixedPoint(eqx.Module):

@@ -112,7 +112,7 @@ class Problem(eqx.Module):
     kinds: tuple[ElementType, ...] = eqx.field(static=True)
     metric: Metric = eqx.field(static=True)
 
-    def _scan(self, function: Callable[..., Any], start: Any, points: Field) -> Any:
+    def scan(self, function: Callable[..., Any], start: Any, points: Field) -> Any:
         """Carry `start` through all chunks: ``(carry, kind, chunk) -> carry``."""
         for kind, block in zip(self.kinds, self.blocks, strict=True):
 
@@ -201,7 +201,7 @@ class Problem(eqx.Module):
             worst = jnp.minimum(worst, jnp.where(counts, det, jnp.inf).min())
             return total + data.weight @ energy, worst
 
-        return self._scan(add, (jnp.zeros((), points.dtype), jnp.full((), jnp.inf, points.dtype)), points)
+        return self.scan(add, (jnp.zeros((), points.dtype), jnp.full((), jnp.inf, points.dtype)), points)
 
     def value_and_grad(self, points: Field, eps: Scalar) -> tuple[Float[Array, ""], Field]:
         """The objective and its gradient with respect to all points."""
@@ -220,7 +220,7 @@ class Problem(eqx.Module):
             return total + data.weight @ energies, chunk.add(gradient, slopes)
 
         start = (jnp.zeros((), points.dtype), jnp.zeros_like(points))
-        return self._scan(add, start, points)
+        return self.scan(add, start, points)
 
     def quadratic(self, points: Field, eps: Scalar) -> Quadratic:
         """The objective, its gradient and its Hessian model."""
