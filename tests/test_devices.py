@@ -5,8 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jax
-
 PROGRAM = """
 import jax, jax.numpy as jnp, numpy as np
 jax.config.update("jax_num_cpu_devices", 2)
@@ -42,7 +40,6 @@ def test_batches_are_split_among_devices():
     """Runs under `shard_map` with its checks, and gradients of an input that is split."""
     here = Path(__file__).parent
     env = os.environ | {"PYTHONPATH": f"{here}{os.pathsep}{here.parent}"}
-    env["JAX_COMPILATION_CACHE_DIR"] = str(jax.config.jax_compilation_cache_dir)
     program = [sys.executable, "-c", PROGRAM]
     done = subprocess.run(program, env=env, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
