@@ -32,13 +32,13 @@ _HOMES = {
     "methods": ("METHODS", "Elastic", "Laplacian", "Method", "Optimize"),
     "methods.elastic.elasticity": ("Material",),
     "methods.optimize.energy": ("Energy", "energy"),
-    "methods.optimize.goals": ("Goal", "Stage"),
+    "methods.optimize.goals": ("Goal", "Stage", "When"),
     "methods.optimize.minimise": ("Minimiser",),
     "methods.optimize.problem": ("Aggregation",),
     "metrics.evaluation": ("Evaluation", "evaluate"),
     "metrics.record": ("Metric",),
     "metrics.summary": ("Statistics", "statistics"),
-    "metrics.table": ("METRICS", "quality", "quality_least", "quality_mean"),
+    "metrics.table": ("METRICS", "quality", "quality_mean"),
     "motion.base": ("Motion",),
     "motion.coupled": ("Coupled", "couple"),
     "motion.curved": ("Sliding",),
@@ -47,7 +47,6 @@ _HOMES = {
     "motion.given": ("host_nearest", "on_surface"),
     "motion.planar": ("Constraints",),
     "runs.batch": ("Batch", "stack"),
-    "runs.design": ("Design", "design", "filter_gradient"),
     "runs.driver": ("SmoothResult", "smooth"),
     "runs.optimum": ("Optimum", "optimum"),
     "runs.pure": ("FixedPoint", "Run", "fixed_point", "if_valid", "run", "step"),
@@ -63,7 +62,6 @@ __all__ = [
     "Batch",
     "Constraints",
     "Coupled",
-    "Design",
     "Elastic",
     "Energy",
     "Evaluation",
@@ -94,15 +92,14 @@ __all__ = [
     "Statistics",
     "Status",
     "Target",
+    "When",
     "as_mesh",
     "boundary_layers",
     "couple",
-    "design",
     "detect_constraints",
     "element_type",
     "energy",
     "evaluate",
-    "filter_gradient",
     "find_periodic",
     "fixed_point",
     "follow",
@@ -114,7 +111,6 @@ __all__ = [
     "on_surface",
     "optimum",
     "quality",
-    "quality_least",
     "quality_mean",
     "read",
     "run",
@@ -147,13 +143,13 @@ if TYPE_CHECKING:
     from jaxsmooth.methods import METHODS, Elastic, Laplacian, Method, Optimize
     from jaxsmooth.methods.elastic.elasticity import Material
     from jaxsmooth.methods.optimize.energy import Energy, energy
-    from jaxsmooth.methods.optimize.goals import Goal, Stage
+    from jaxsmooth.methods.optimize.goals import Goal, Stage, When
     from jaxsmooth.methods.optimize.minimise import Minimiser
     from jaxsmooth.methods.optimize.problem import Aggregation
     from jaxsmooth.metrics.evaluation import Evaluation, evaluate
     from jaxsmooth.metrics.record import Metric
     from jaxsmooth.metrics.summary import Statistics, statistics
-    from jaxsmooth.metrics.table import METRICS, quality, quality_least, quality_mean
+    from jaxsmooth.metrics.table import METRICS, quality, quality_mean
     from jaxsmooth.motion.base import Motion
     from jaxsmooth.motion.coupled import Coupled, couple
     from jaxsmooth.motion.curved import Sliding
@@ -162,7 +158,6 @@ if TYPE_CHECKING:
     from jaxsmooth.motion.given import host_nearest, on_surface
     from jaxsmooth.motion.planar import Constraints
     from jaxsmooth.runs.batch import Batch, stack
-    from jaxsmooth.runs.design import Design, design, filter_gradient
     from jaxsmooth.runs.driver import SmoothResult, smooth
     from jaxsmooth.runs.optimum import Optimum, optimum
     from jaxsmooth.runs.pure import FixedPoint, Run, fixed_point, if_valid, run, step

@@ -16,7 +16,6 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxsmooth.mesh.execution import Execution
 from jaxsmooth.mesh.record import Mesh
-from jaxsmooth.numerics.varying import varying_like
 
 __all__ = [
     "Chunk",
@@ -141,7 +140,6 @@ def scan(
         local = jax.tree.map(lambda field: gather(field, nodes), fields)
         return function(carry, Chunk(nodes, real, data, local))
 
-    start = varying_like(start, (chunks, fields))
     return jax.lax.scan(visit, start, (chunks.nodes, chunks.real, chunks.data))
 
 

@@ -11,7 +11,7 @@ import pytest
 
 import jaxsmooth as js
 from jaxsmooth.mesh.record import Mesh
-from jaxsmooth.methods.optimize.goals import GOALS, Goal, Stage
+from jaxsmooth.methods.optimize.goals import GOALS, Goal, Stage, When
 from jaxsmooth.methods.optimize.method import Optimize
 from jaxsmooth.methods.optimize.minimise import Jaxopt, Newton, Optax, Optimistix
 from jaxsmooth.methods.optimize.problem import Aggregation, problem
@@ -246,8 +246,8 @@ def test_given_size_pulls_measures_together():
 def test_options_are_checked():
     with pytest.raises(ValueError, match="goal must be a Goal, or one of average, worst, bal"):
         Optimize(goal="best")
-    with pytest.raises(ValueError, match="neither repairs nor untangles"):
-        Goal((Stage(1, 1, 2, repairing=True),))
+    with pytest.raises(ValueError, match="for meshes in which nothing is poor"):
+        Goal((Stage(1, 1, 2, When.WORSENED),))
     with pytest.raises(ValueError, match="unknown metric 'beauty'"):
         Optimize(metric="beauty")
     with pytest.raises(ValueError, match="'min_jacobian' can't be optimised: it has a unit of measure"):

@@ -18,7 +18,7 @@ _TITLE = "jaxsmooth demo"
 
 
 def run(directory: Path, outputs: Outputs) -> None:
-    """Smooth the demo mesh; write the result and a report to `directory`, with matplotlib also a picture.
+    """Smooth the demo mesh; write the result to `directory`, with matplotlib also a picture and a report.
 
     The files are committed to `outputs`; without matplotlib a line says what is missing.
     """
@@ -26,16 +26,15 @@ def run(directory: Path, outputs: Outputs) -> None:
     from jaxsmooth.files.io import check_output, read, write_to
     from jaxsmooth.methods import Elastic
     from jaxsmooth.report import report
-    from jaxsmooth.report.page import html_page
     from jaxsmooth.runs.driver import smooth
 
     out = report.console()
-    names = ["bracket-smooth.vtu", "report.html"]
+    names = ["bracket-smooth.vtu"]
     draw = _before_after(out)
     if draw is not None:
-        names.append("before-after.png")
+        names += ["before-after.png", "report.html"]
     outputs.folder(directory)
-    mesh_path, page_path, *picture_paths = paths = [directory / name for name in names]
+    mesh_path, *picture_paths = paths = [directory / name for name in names]
     for path in paths:
         check_output(path)
     file = read(MESH)
@@ -48,7 +47,7 @@ def run(directory: Path, outputs: Outputs) -> None:
         figure = draw(before, result.mesh, f"{_TITLE}: a bracket, elastic-extended")
         with outputs.file(picture_paths[0]) as part:
             figure.savefig(part, dpi=130)
-    outputs.text(page_path, html_page(_TITLE, before, result, settings={"method": "elastic-extended"}))
+        outputs.text(picture_paths[1], report.html_page(_TITLE, before, result))
     report.print_comparison(out, before, result)
     outputs.commit()
     out.print(f"{result.status}; wrote {', '.join(names)} to {directory}/")
@@ -59,6 +58,6 @@ def _before_after(out: Console) -> Callable[..., Any] | None:
     try:
         from jaxsmooth.report.pictures import before_after
     except ImportError as missing:
-        out.print(f"no picture: {missing}", style="yellow")
+        out.print(f"neither picture nor report: {missing}", style="yellow")
         return None
     return before_after

@@ -19,7 +19,7 @@ from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.methods.base import Method, Proposal
 from jaxsmooth.methods.elastic.method import Elastic
 from jaxsmooth.methods.optimize.distortion import METRICS, check_metric
-from jaxsmooth.methods.optimize.goals import BALANCED, GOALS, UNTANGLE, Goal
+from jaxsmooth.methods.optimize.goals import BALANCED, GOALS, UNTANGLE, Goal, When
 from jaxsmooth.methods.optimize.minimise import Minimiser, Newton
 from jaxsmooth.methods.optimize.problem import Aggregation, Problem, problem
 from jaxsmooth.metrics.evaluation import Evaluation
@@ -41,6 +41,7 @@ _NO_DERIVATIVE = (
     "use js.optimum, which solves for one optimum and differentiates that, or Elastic"
 )
 _SLACK = 1.0002  # a rise of the largest e that needs no repair
+_NEAR = 1 / (POOR + 0.0175)  # the e from which elements are close to being poor
 
 
 class _Start(NamedTuple):
@@ -162,9 +163,10 @@ class Optimize(Method):
 
         def minimise(state, stage, ordered):
             points, dtype = state.points, state.points.dtype
-            pivot = jnp.where(stage.repairing, start.worst, self._pivot(ordered))
-            numbers = [jnp.asarray(value, dtype) for value in (*stage[:3], pivot)]
-            give_up = tuple(out | ~stage.untangling for out in hopeless)
+            usual = self._pivot(ordered)
+            pivot = jnp.stack([usual, usual, usual, _NEAR, start.worst])[stage.when]
+            numbers = [jnp.asarray(value, dtype) for value in (*stage[:-1], pivot)]
+            give_up = tuple(out | (stage.when != When.INVERTED) for out in hopeless)
             here = eqx.tree_at(lambda t: t.aggregation, task, Aggregation(*numbers))
             found = self.minimiser(here.giving_up(points, give_up), points)
             inverted = task.inverted(found.points, hopeless)
@@ -174,15 +176,17 @@ class Optimize(Method):
 
         def go(state, stage):
             ordered = _look(task, state.points).ordered
-            sound = stage.repairing & ((tangled > 0) | (ordered[-1] <= _SLACK * start.worst))
-            return jax.lax.cond(sound, lambda state, *_: state, minimise, state, stage, ordered)
+            poor = ordered[-1] > 1 / POOR
+            worsened = (tangled == 0) & (ordered[-1] > _SLACK * start.worst)
+            due = jnp.stack([True, True, ~poor, poor, worsened])[stage.when]
+            return jax.lax.cond(due, minimise, lambda state, *_: state, state, stage, ordered)
 
         def guarded(points):
             return _VALID(start.mesh, start.motion, points - start.mesh.points, start.evaluation).points
 
         def run(state, numbered):
             index, stage = numbered
-            idle = stage.untangling & ((state.fewest == 0) | (state.waited > _PATIENCE))
+            idle = (stage.when == When.INVERTED) & ((state.fewest == 0) | (state.waited > _PATIENCE))
             state = jax.lax.cond(idle, lambda state, _: state, go, state, stage)
             untangled = (index == self.untangling_stages - 1) & (tangled > 0)
             points = jax.lax.cond(untangled, guarded, lambda points: points, state.points)

@@ -38,6 +38,7 @@ from jaxsmooth.numerics.small import contract, determinant
 
 __all__ = ["Aggregation", "Problem", "problem"]
 
+_REACH = 4.0  # pivots, beyond which the penalty is straight
 _HEAVY = 4  # memory of an element's energy, in units of a product with linear tetrahedra
 
 Field = Float[Array, "nodes dim"]
@@ -51,7 +52,8 @@ class Aggregation(eqx.Module):
     """``φ(e) = average · (1 − 1/e) + worst · (e / pivot)^power / power``.
 
     The first part is one minus the quality, so its mean is 1 − q_avg; the second grows towards a
-    penalty on everything worse than the pivot as the power rises (a p-norm continuation).
+    penalty on everything worse than the pivot as the power rises (a p-norm continuation).  From four
+    pivots on the power goes on as its tangent: it stays convex, and finite in float32.
     """
 
     average: Scalar
@@ -61,12 +63,17 @@ class Aggregation(eqx.Module):
 
     def __call__(self, e: Float[Array, "..."]) -> Float[Array, "..."]:
         """φ(e)."""
-        return self.average * (1 - 1 / e) + self.worst / self.power * (e / self.pivot) ** self.power
+        ratio = e / self.pivot
+        near = jnp.minimum(ratio, _REACH)
+        penalty = near**self.power / self.power + near ** (self.power - 1) * (ratio - near)
+        return self.average * (1 - 1 / e) + self.worst * penalty
 
     def derivatives(self, e: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """φ′ and φ″."""
-        rise = self.worst / self.pivot * (e / self.pivot) ** (self.power - 1)
-        return self.average / e**2 + rise, -2 * self.average / e**3 + (self.power - 1) / e * rise
+        ratio = e / self.pivot
+        rise = self.worst / self.pivot * jnp.minimum(ratio, _REACH) ** (self.power - 1)
+        bend = jnp.where(ratio < _REACH, (self.power - 1) / e * rise, 0)
+        return self.average / e**2 + rise, -2 * self.average / e**3 + bend
 
 
 # --- The whole mesh ------------------------------------------------------------------------------
