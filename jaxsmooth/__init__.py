@@ -38,7 +38,7 @@ _HOMES = {
     "metrics.evaluation": ("Evaluation", "evaluate"),
     "metrics.record": ("Metric",),
     "metrics.summary": ("Statistics", "statistics"),
-    "metrics.table": ("METRICS", "quality", "quality_mean"),
+    "metrics.table": ("METRICS", "quality", "quality_least", "quality_mean"),
     "motion.base": ("Motion",),
     "motion.coupled": ("Coupled", "couple"),
     "motion.curved": ("Sliding",),
@@ -47,6 +47,7 @@ _HOMES = {
     "motion.given": ("host_nearest", "on_surface"),
     "motion.planar": ("Constraints",),
     "runs.batch": ("Batch", "stack"),
+    "runs.design": ("Design", "design", "filter_gradient"),
     "runs.driver": ("SmoothResult", "smooth"),
     "runs.optimum": ("Optimum", "optimum"),
     "runs.pure": ("FixedPoint", "Run", "fixed_point", "if_valid", "run", "step"),
@@ -62,6 +63,7 @@ __all__ = [
     "Batch",
     "Constraints",
     "Coupled",
+    "Design",
     "Elastic",
     "Energy",
     "Evaluation",
@@ -96,10 +98,12 @@ __all__ = [
     "as_mesh",
     "boundary_layers",
     "couple",
+    "design",
     "detect_constraints",
     "element_type",
     "energy",
     "evaluate",
+    "filter_gradient",
     "find_periodic",
     "fixed_point",
     "follow",
@@ -111,6 +115,7 @@ __all__ = [
     "on_surface",
     "optimum",
     "quality",
+    "quality_least",
     "quality_mean",
     "read",
     "run",
@@ -149,7 +154,7 @@ if TYPE_CHECKING:
     from jaxsmooth.metrics.evaluation import Evaluation, evaluate
     from jaxsmooth.metrics.record import Metric
     from jaxsmooth.metrics.summary import Statistics, statistics
-    from jaxsmooth.metrics.table import METRICS, quality, quality_mean
+    from jaxsmooth.metrics.table import METRICS, quality, quality_least, quality_mean
     from jaxsmooth.motion.base import Motion
     from jaxsmooth.motion.coupled import Coupled, couple
     from jaxsmooth.motion.curved import Sliding
@@ -158,6 +163,7 @@ if TYPE_CHECKING:
     from jaxsmooth.motion.given import host_nearest, on_surface
     from jaxsmooth.motion.planar import Constraints
     from jaxsmooth.runs.batch import Batch, stack
+    from jaxsmooth.runs.design import Design, design, filter_gradient
     from jaxsmooth.runs.driver import SmoothResult, smooth
     from jaxsmooth.runs.optimum import Optimum, optimum
     from jaxsmooth.runs.pure import FixedPoint, Run, fixed_point, if_valid, run, step

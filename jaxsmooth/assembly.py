@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxsmooth.mesh.execution import Execution
 from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.numerics.varying import varying_like
 
 __all__ = [
     "Chunk",
@@ -140,6 +141,7 @@ def scan(
         local = jax.tree.map(lambda field: gather(field, nodes), fields)
         return function(carry, Chunk(nodes, real, data, local))
 
+    start = varying_like(start, (chunks, fields))
     return jax.lax.scan(visit, start, (chunks.nodes, chunks.real, chunks.data))
 
 

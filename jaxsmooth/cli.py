@@ -130,7 +130,7 @@ def _smooth(options: argparse.Namespace, outputs: Outputs) -> int:
     _print_losses(out, late, options.output)
     report.print_comparison(out, file.mesh, result)
     if options.report is not None:
-        outputs.text(options.report, report.html_page(Path(options.input).name, file.mesh, result))
+        _write_report(outputs, options, file, result, clock.split())
     if options.json is not None:
         notes, seconds = (*file.notes, *notes, *late), clock.split()
         row = report.as_json(options.input, options.output, options.method, result, seconds, notes)
@@ -221,8 +221,6 @@ def _check_before_smoothing(options: argparse.Namespace) -> None:
     if options.report == "-":
         raise ValueError("--report -: a report can't go to standard output; name a file")
     _check_side_files(options, OUT=options.output)
-    if options.report is not None:
-        import jaxsmooth.report.pictures  # noqa: F401  it says what is missing
 
 
 def _check_run_options(options: argparse.Namespace) -> None:
@@ -311,6 +309,15 @@ def _print_losses(out: Console, notes: tuple[str, ...], output: str) -> None:
     report.print_notes(out, notes)
     for note in notes if out.quiet else ():
         complain(f"{output}: {note}")
+
+
+def _write_report(outputs: Outputs, options: argparse.Namespace, file: MeshFile, result: Any, seconds: dict):
+    from jaxsmooth.report.page import html_page
+
+    left_out = ("run", "json", "report", "quiet", "force", "precision", "no_cache")
+    settings = {name.replace("_", " "): v for name, v in vars(options).items() if name not in left_out}
+    title, more = Path(options.input).name, {"settings": settings, "seconds": seconds, "notes": file.notes}
+    outputs.text(options.report, html_page(title, file.mesh, result, **more))
 
 
 def _write_json(outputs: Outputs, path: str, content: dict[str, Any]) -> None:

@@ -29,14 +29,14 @@ def test_facets_are_found_once_for_a_topology(monkeypatch):
 
 
 def test_one_smooth_with_report_and_json_evaluates_a_mesh_once_a_step(monkeypatch, tmp_path):
-    from jaxsmooth.report import report
+    from jaxsmooth.report import page, report
 
     evaluations = []
     evaluate = summary._evaluate
     monkeypatch.setattr(summary, "_evaluate", lambda mesh: evaluations.append(1) or evaluate(mesh))
     mesh = square()
     result = js.smooth(mesh, steps=2, tolerance_avg=0)
-    report.write_html(tmp_path / "report.html", "square", mesh, result)
+    page.write_html(tmp_path / "report.html", "square", mesh, result)
     report.as_json("in", "out", "elastic", result, {})
     assert len(evaluations) == 1  # of the input; steps evaluate what they make
 

@@ -18,7 +18,7 @@ _TITLE = "jaxsmooth demo"
 
 
 def run(directory: Path, outputs: Outputs) -> None:
-    """Smooth the demo mesh; write the result to `directory`, with matplotlib also a picture and a report.
+    """Smooth the demo mesh; write the result and a report to `directory`, with matplotlib also a picture.
 
     The files are committed to `outputs`; without matplotlib a line says what is missing.
     """
@@ -26,15 +26,16 @@ def run(directory: Path, outputs: Outputs) -> None:
     from jaxsmooth.files.io import check_output, read, write_to
     from jaxsmooth.methods import Elastic
     from jaxsmooth.report import report
+    from jaxsmooth.report.page import html_page
     from jaxsmooth.runs.driver import smooth
 
     out = report.console()
-    names = ["bracket-smooth.vtu"]
+    names = ["bracket-smooth.vtu", "report.html"]
     draw = _before_after(out)
     if draw is not None:
-        names += ["before-after.png", "report.html"]
+        names.append("before-after.png")
     outputs.folder(directory)
-    mesh_path, *picture_paths = paths = [directory / name for name in names]
+    mesh_path, page_path, *picture_paths = paths = [directory / name for name in names]
     for path in paths:
         check_output(path)
     file = read(MESH)
@@ -47,7 +48,7 @@ def run(directory: Path, outputs: Outputs) -> None:
         figure = draw(before, result.mesh, f"{_TITLE}: a bracket, elastic-extended")
         with outputs.file(picture_paths[0]) as part:
             figure.savefig(part, dpi=130)
-        outputs.text(picture_paths[1], report.html_page(_TITLE, before, result))
+    outputs.text(page_path, html_page(_TITLE, before, result, settings={"method": "elastic-extended"}))
     report.print_comparison(out, before, result)
     outputs.commit()
     out.print(f"{result.status}; wrote {', '.join(names)} to {directory}/")
@@ -58,6 +59,6 @@ def _before_after(out: Console) -> Callable[..., Any] | None:
     try:
         from jaxsmooth.report.pictures import before_after
     except ImportError as missing:
-        out.print(f"neither picture nor report: {missing}", style="yellow")
+        out.print(f"no picture: {missing}", style="yellow")
         return None
     return before_after

@@ -18,6 +18,7 @@ from jaxsmooth.metrics.evaluation import Evaluation, evaluate
 from jaxsmooth.metrics.summary import POOR
 from jaxsmooth.motion.base import Motion
 from jaxsmooth.numerics.small import Frame
+from jaxsmooth.numerics.varying import varying_like
 
 __all__ = ["PatchGuard"]
 
@@ -103,7 +104,7 @@ class PatchGuard(Guard):
             return (sweeps == 0) | (bad & ~still(count)).any()
 
         nothing = jnp.zeros(len(mesh.points), jnp.int32)
-        state = nothing, start, nothing > 0, jnp.int32(0)
+        state = varying_like((nothing, start, nothing > 0, jnp.int32(0)), plain)
         count, after, _, sweeps = jax.lax.while_loop(unfinished, sweep, state)
         part = checkpoint_name(fraction(count, limit), "accepted")
         return Guarded(moved(mesh, motion, move, part).points, after, (moves & (part < 1)).sum(), sweeps)

@@ -46,6 +46,7 @@ __all__ = [
     "min_jacobian",
     "named",
     "quality",
+    "quality_least",
     "quality_mean",
     "scaled_jacobian",
     "shape_quality",
@@ -125,3 +126,16 @@ def quality_mean(mesh: Any, metric: Metric | str = SHAPE) -> Float[Array, ""]:
     metric, mesh = as_metric(metric), as_mesh(mesh)
     found = zip(mesh.blocks, quality(mesh, metric), strict=True)
     return jnp.concatenate([values for (kind, _), values in found if metric.applies_to(kind)]).mean()
+
+
+def quality_least(
+    mesh: Any, metric: Metric | str = SHAPE, sharpness: Float[Array, ""] | float = 100.0
+) -> Float[Array, ""]:
+    """A smooth bound below the least quality, for constraints: ``−log Σ exp(−s q) / s`` over all elements.
+
+    Of n elements it is no more than ``log(n) / s`` below the least.
+    """
+    metric, mesh = as_metric(metric), as_mesh(mesh)
+    found = zip(mesh.blocks, quality(mesh, metric), strict=True)
+    q = jnp.concatenate([values for (kind, _), values in found if metric.applies_to(kind)])
+    return -jax.nn.logsumexp(-sharpness * q) / sharpness

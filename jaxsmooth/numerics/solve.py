@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsmooth.numerics.admissible import Admissible
 from jaxsmooth.numerics.small import cofactors, determinant
+from jaxsmooth.numerics.varying import varying_like
 
 __all__ = [
     "Solution",
@@ -127,6 +127,7 @@ def conjugate_gradients(
     z = precondition(b)
     zero, no = jnp.int32(0), jnp.bool_(False)
     start = _Iterate(jnp.zeros_like(b), b, z, jnp.vdot(b, z), unit, unit, zero, zero, no, ~(unit > goal))
+    start = varying_like(start, z)
     end = jax.lax.while_loop(lambda s: ~s.done, iterate, start)
     residual = jnp.sqrt(end.square / jnp.where(empty, 1, unit))
     return Solution(end.x * jnp.where(empty, 0, size), end.iterations, residual)
@@ -162,8 +163,8 @@ def solve_projected(
         The displacement u, with the iterations it took and its true relative residual.
     """
     system = (operator, jax.lax.stop_gradient(diagonal), admissible, force)
-    found = _solve(system, tolerance, max_iterations)
-    return found._replace(field=admissible.followed(found.field))
+    field, (iterations, residual) = _solve(system, tolerance, max_iterations)
+    return Solution(admissible.followed(field), iterations.astype(jnp.int32), residual)
 
 
 def gradient_tolerance(dtype: Any) -> float:
@@ -172,19 +173,20 @@ def gradient_tolerance(dtype: Any) -> float:
 
 
 @jax.custom_jvp
-def _solve(system, tolerance, max_iterations) -> Solution:
+def _solve(system, tolerance, max_iterations):
+    """The independent field, and iterations and residual in its type: integers' tangents know no device."""
     matvec, right, solver = _equations(system, tolerance, max_iterations)
     field, (iterations, residual) = solver(matvec, right)
-    return Solution(system[2].restrict(field), iterations, residual)
+    return system[2].restrict(field), (iterations.astype(field.dtype), residual)
 
 
 @_solve.defjvp
 def _solve_jvp(primals, tangents):
     """With A w = b:  A dw = db − dA w."""
     system, tolerance, max_iterations = primals
-    solution = _solve(system, tolerance, max_iterations)
+    field, counts = _solve(system, tolerance, max_iterations)
     # saved under this name, a rematerialised step need not solve again
-    field = checkpoint_name(solution.field, "displacement")
+    field = checkpoint_name(field, "displacement")
 
     def residual(system):
         matvec, right, _ = _equations(system, tolerance, max_iterations)
@@ -193,8 +195,7 @@ def _solve_jvp(primals, tangents):
     _, change = jax.jvp(residual, (system,), tangents[:1])
     matvec, _, solver = _equations(system, tolerance, max_iterations)
     slope, _ = jax.lax.custom_linear_solve(matvec, change, solver, symmetric=True, has_aux=True)
-    iterations: Any = np.zeros((), jax.dtypes.float0)  # the tangent of an integer is NumPy's
-    return solution._replace(field=field), Solution(slope, iterations, jnp.zeros_like(solution.residual))
+    return (field, counts), (slope, jax.tree.map(jnp.zeros_like, counts))
 
 
 def _equations(system, tolerance, max_iterations):

@@ -1,16 +1,11 @@
-"""What people see: progress lines, tables, JSON, and the HTML report."""
+"""What people see: progress lines, tables, JSON."""
 
 from __future__ import annotations
 
-import base64
-import html
-import io
 import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -19,7 +14,6 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxsmooth.convert.meshfile import MeshFile
-from jaxsmooth.files.outputs import Outputs
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.mesh.topology import signed_measures
 from jaxsmooth.metrics.summary import POOR, corners, evaluated
@@ -34,11 +28,9 @@ __all__ = [
     "compare_row",
     "console",
     "counts",
-    "html_page",
     "movable_elements",
     "print_compare",
     "print_comparison",
-    "write_html",
 ]
 
 
@@ -290,49 +282,3 @@ def print_compare(out: Console, rows: list[dict[str, Any]]) -> None:
         table.add_row(row["method"], *cells)
     out.print(table)
     out.print("all elements | elements with a node that may move; seconds without compilation", style="dim")
-
-
-# --- HTML ------------------------------------------------------------------------------
-
-
-def write_html(path: str | Path, title: str, before: Mesh, result: SmoothResult) -> None:
-    """Write `html_page` to a file, complete or not at all."""
-    with Outputs() as outputs:
-        outputs.text(path, html_page(title, before, result))
-        outputs.commit()
-
-
-def html_page(title: str, before: Mesh, result: SmoothResult) -> str:
-    """A report in one page: picture, before/after table, history.  Needs the `viz` extra."""
-    from jaxsmooth.report.pictures import before_after
-
-    title = title.encode("utf-8", "replace").decode()  # names of files may be any bytes
-    buffer = io.BytesIO()
-    before_after(before, result.mesh, title).savefig(buffer, format="png", dpi=130)
-    picture = base64.b64encode(buffer.getvalue()).decode()
-    table = _html_table(
-        ("", "all before", "all after", "movable before", "movable after"), comparison(before, result)
-    )
-    heads = ("step", "q_min", "q_avg", "q_max", "σ", "q < 0.2", "inverted", "iterations", "seconds")
-    steps = []
-    for row in result.history:
-        s = asdict(row.statistics)
-        numbers = [f"{s[key]:.4f}" for key in ("q_min", "q_avg", "q_max", "q_std")]
-        tail = (s["below"], s["inverted"], row.solver_iterations, f"{row.seconds:.2f}")
-        steps.append((row.step, *numbers, *tail))
-    title = html.escape(title)
-    return f"""<!doctype html><meta charset="utf-8"><title>{title}</title>
-<style>body{{font:15px/1.5 system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem}}
-td,th{{padding:.15rem .8rem;text-align:right}}td:first-child,th:first-child{{text-align:left}}
-tr:nth-child(even){{background:#f4f4f4}}img{{max-width:100%}}</style>
-<h1>{title}</h1><p>{html.escape(str(result.status))}; {len(result.mesh.points):,} nodes.</p>
-<img alt="before and after" src="data:image/png;base64,{picture}">{table}
-<h2>Steps</h2>{_html_table(heads, steps)}
-"""
-
-
-def _html_table(heads: tuple[str, ...], rows: list[tuple]) -> str:
-    def line(cells: tuple, tag: str) -> str:
-        return "<tr>" + "".join(f"<{tag}>{html.escape(str(c))}</{tag}>" for c in cells) + "</tr>"
-
-    return f"<table>{line(heads, 'th')}{''.join(line(row, 'td') for row in rows)}</table>"

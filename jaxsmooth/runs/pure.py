@@ -22,6 +22,7 @@ from jaxsmooth.motion.base import Motion
 from jaxsmooth.numerics.implicit import attach_root, conjugate_residuals
 from jaxsmooth.numerics.small import in_precision
 from jaxsmooth.numerics.solve import gradient_tolerance
+from jaxsmooth.numerics.varying import varying_like
 
 __all__ = ["FixedPoint", "Run", "fixed_point", "if_valid", "method_state", "run", "step"]
 
@@ -115,7 +116,7 @@ def run(
             counts = jnp.asarray(done.residual, dtype), done.iterations, done.shortened.astype(jnp.int32)
             return done.points, jax.lax.stop_gradient(counts)
 
-        return jax.lax.cond(index < steps, move, lambda p: (p, nothing), points)
+        return jax.lax.cond(index < steps, move, lambda p: varying_like((p, nothing), p), points)
 
     inner = steps if steps <= _UNNESTED else math.ceil(math.sqrt(steps))
     outer = -(-steps // max(inner, 1))
