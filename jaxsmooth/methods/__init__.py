@@ -19,3 +19,4 @@ METHODS: dict[str, Callable[[], Method]] = {
     "smart-weighted-laplacian": partial(Laplacian, smart=True, weighted=True),
     "optimize": Optimize,
 }
+"""What makes each method, by its name on the command line."""

@@ -1,0 +1,109 @@
+"""The pages in docs: their code runs, they have all public names, and what they link to is there."""
+
+import re
+from importlib import import_module
+from pathlib import Path
+
+import jax
+import meshes
+import meshio
+import numpy as np
+import pytest
+from test_curved import disc
+from test_readme import ROOT, blocks
+
+import jaxsmooth as js
+
+DOCS = ROOT / "docs"
+PAGES = sorted(str(path.relative_to(ROOT)) for path in DOCS.rglob("*.md"))
+
+
+def layered():
+    """A channel: three layers of flat cells on its floor, squares above, some of them crooked."""
+    x, y = np.linspace(0, 1, 9), np.array([0, 0.004, 0.009, 0.016, 0.12, 0.25, 0.38, 0.5])
+    points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
+    points[1:-1, 5:-1] += 0.02 * np.random.default_rng(0).normal(size=(7, 2, 2))
+    number = np.arange(72).reshape(9, 8)
+    corners = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    return meshio.Mesh(points.reshape(-1, 2), {"quad": np.stack([c.ravel() for c in corners], axis=1)})
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """What the pages read."""
+    points, cells = meshes.grid("tetra", (3, 3, 3), 0.2)
+    solid = meshio.Mesh(np.asarray(points), cells)
+    meshio.write(tmp_path / "part.msh", solid, file_format="gmsh22")
+    solid.point_sets = {"BOLTS": np.flatnonzero(np.linalg.norm(solid.points - 0.5, axis=1) < 0.4)}
+    meshio.write(tmp_path / "part.inp", solid)
+    js.write(tmp_path / "layers.vtu", layered())
+    js.write(tmp_path / "disc.vtu", disc("triangle", 3))
+    rng = np.random.default_rng(0)
+    points, cells = meshes.grid("tetra", (3, 3, 3), 0.0)
+    cell = np.asarray(points).copy()
+    cell[((cell > 0) & (cell < 1)).all(axis=1)] += 0.05
+    js.write(tmp_path / "cell.vtu", (cell, cells))
+    points, cells = meshes.grid("triangle", (5, 5), 0.15)
+    js.write(tmp_path / "plate.vtu", (np.asarray(points), cells))
+    points, cells = meshes.grid("triangle", (5, 5), 0.0)
+    points = np.asarray(points).copy()
+    inner = ((points > 0) & (points < 1)).all(axis=1)
+    points[inner] += 0.25 * (rng.random((inner.sum(), 2)) - 0.5)
+    js.write(tmp_path / "tangled.vtu", js.Mesh(points, cells))
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if "```python" in (ROOT / page).read_text()])
+def test_the_code_of_the_pages_runs(page, files):
+    if "libraries" in page:
+        for name in ("pyvista", "skfem", "gmsh"):
+            pytest.importorskip(name)
+    names = {}
+    for line, code in blocks(page, "python"):
+        exec(compile("\n" * line + code, str(ROOT / page), "exec"), names)
+    for name in ("gradient", "result"):
+        for leaf in jax.tree.leaves(getattr(names.get(name), "points", names.get(name))):
+            if isinstance(leaf, jax.Array):
+                assert bool(np.isfinite(np.asarray(leaf, float)).all())
+
+
+def targets():
+    return re.findall(r"^::: (\S+)$", (DOCS / "reference.md").read_text(), re.M)
+
+
+def test_every_public_name_is_in_the_reference():
+    found = [target.rpartition(".")[2] for target in targets()]
+    assert sorted(found) == sorted(js.__all__)
+
+
+@pytest.mark.parametrize("name", js.__all__)
+def test_every_public_name_is_documented(name):
+    target = next(target for target in targets() if target.endswith(f".{name}"))
+    if name == "gmsh":
+        module = import_module(target)
+        assert all(getattr(module, each).__doc__ for each in ("__name__", *module.__all__))
+        return
+    home, _, own = target.rpartition(".")
+    thing = getattr(import_module(home), own)
+    assert thing is getattr(js, name)
+    if isinstance(thing, dict):
+        source = Path(import_module(home).__file__).read_text()
+        assert re.search(rf'^{name}\b.*?^"""\w', source, re.M | re.S)
+    else:
+        assert thing.__doc__
+        assert not thing.__doc__.startswith(f"{name}(")  # what a record has without one
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_somewhere(page):
+    text, folder = (ROOT / page).read_text(), (ROOT / page).parent
+    links = re.findall(r"\]\((?!https?:)([^)]+)\)", text)
+    for path, _, anchor in (link.partition("#") for link in links):
+        assert (folder / path).exists(), path
+        heads = re.findall(r"^#+ (.*)$", (folder / path).read_text(), re.M) if anchor else []
+        assert not anchor or anchor in [head.lower().replace(" ", "-") for head in heads]
+
+
+def test_the_site_has_all_pages():
+    named = re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text())
+    assert sorted(f"docs/{name}" for name in named) == PAGES
