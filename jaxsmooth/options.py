@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
 
 from jaxsmooth import __version__
 
@@ -16,8 +15,8 @@ METHODS = (
 GOALS = ("average", "worst", "balanced")
 
 
-def parser(runs: Mapping[str, Callable[..., int]]) -> argparse.ArgumentParser:
-    """The parser; the options of a command have its function as `run`."""
+def parser() -> argparse.ArgumentParser:
+    """The parser; the options of a command name its function in `jaxsmooth.commands`."""
     root = argparse.ArgumentParser(
         prog="jaxsmooth",
         description="Improve finite-element meshes by moving their nodes.",
@@ -27,44 +26,63 @@ def parser(runs: Mapping[str, Callable[..., int]]) -> argparse.ArgumentParser:
     root.add_argument("--version", action="version", version=f"jaxsmooth {__version__}")
     commands = root.add_subparsers(required=True, metavar="COMMAND")
 
-    command = commands.add_parser("smooth", help="read a mesh, smooth it, write it")
-    command.add_argument("input", metavar="IN", help="mesh file in any format that meshio reads, or .npz")
-    command.add_argument("output", metavar="OUT", help="where to write; the name chooses the format")
-    help = f"one of {METHODS} (default: elastic)"
-    command.add_argument("--method", default="elastic", metavar="NAME", help=help)
-    command.add_argument("--force", action="store_true", help="allow OUT to be IN (default: refuse)")
-    help = "write a report with pictures; needs matplotlib (default: none)"
-    command.add_argument("--report", metavar="FILE.html", help=help)
-    _add_run_options(command)
-    command.set_defaults(run=runs["smooth"])
+    _add_smooth(commands)
+    command = commands.add_parser("info", help="print what a file holds, and what would hold its nodes")
+    command.add_argument("input", metavar="IN", help="mesh file; it is only read")
+    _add_motion_options(command)
+    _add_json(command, "the facts")
+    _add_precision(command)
+    command.set_defaults(command="info", steps=None)
 
     command = commands.add_parser("quality", help="print quality statistics of a mesh")
     help = "mesh file (default: the last word behind --metric)"
     command.add_argument("input", nargs="?", metavar="IN", help=help)
     help = "quality metrics, or all: those that the mesh can have (default: the usual six)"
     command.add_argument("--metric", action="extend", nargs="+", default=[], metavar="NAME", help=help)
-    help = "write the numbers, - for standard output (default: none)"
-    command.add_argument("--json", metavar="FILE", help=help)
+    _add_json(command, "the numbers")
     help = "write a row for every element: type, number, region, centroid, metrics (default: none)"
     command.add_argument("--csv", metavar="FILE", help=help)
     help = "write the mesh with the metrics as data of its cells (default: none)"
     command.add_argument("--quality-data", metavar="OUT", help=help)
     _add_precision(command)
-    command.set_defaults(run=runs["quality"])
+    command.set_defaults(command="measure")
 
     command = commands.add_parser("compare", help="run several methods on a mesh, side by side")
     command.add_argument("input", metavar="IN", help="mesh file; it is only read")
     help = f"some of {METHODS} (default: all)"
     command.add_argument("--methods", default=None, metavar="A,B,…", help=help)
     _add_run_options(command)
-    command.set_defaults(run=runs["compare"])
+    command.set_defaults(command="compare")
 
     command = commands.add_parser("demo", help="smooth the mesh that ships with the package")
     help = "folder for its files (default: jaxsmooth-demo)"
     command.add_argument("directory", nargs="?", default="jaxsmooth-demo", metavar="DIR", help=help)
     _add_precision(command)
-    command.set_defaults(run=runs["demo"])
+    command.set_defaults(command="demo")
     return root
+
+
+def _add_smooth(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    command = commands.add_parser(
+        "smooth",
+        help="read a mesh, smooth it, write it; or several",
+        usage="jaxsmooth smooth [options] IN OUT\n       jaxsmooth smooth [options] IN [IN …] --out-dir DIR",
+    )
+    help = "IN and OUT, mesh files; with --out-dir any number of files, and folders of them"
+    command.add_argument("files", nargs="+", metavar="IN OUT", help=help)
+    help = "write all of IN to DIR under their own names; what fails does not stop the others (default: none)"
+    command.add_argument("--out-dir", metavar="DIR", help=help)
+    help = f"one of {METHODS} (default: elastic)"
+    command.add_argument("--method", default="elastic", metavar="NAME", help=help)
+    help = "of OUT: gmsh, gmsh22:ascii, vtu, abaqus, … (default: as its name says, the input's if that fits)"
+    command.add_argument("--format", metavar="NAME", help=help)
+    help = "write the quality of the elements into OUT, as data of its cells (default: no)"
+    command.add_argument("--quality-data", action="store_true", help=help)
+    command.add_argument("--force", action="store_true", help="allow OUT to be IN (default: refuse)")
+    help = "write a report with the mesh to turn, as a page for any browser (default: none)"
+    command.add_argument("--report", metavar="FILE.html", help=help)
+    _add_run_options(command)
+    command.set_defaults(command="smooth")
 
 
 def _add_precision(command: argparse.ArgumentParser) -> None:
@@ -83,6 +101,21 @@ def _add_run_options(command: argparse.ArgumentParser) -> None:
     add("--steps", type=int, default=None, metavar="N", help=help)
     help = f"of the method optimize: one of {', '.join(GOALS)} (default: balanced)"
     add("--goal", choices=GOALS, default=None, metavar="NAME", help=help)
+    _add_motion_options(command)
+    _add_json(command, "history and timings")
+    help = "print only errors, what OUT can't hold, and what stays inverted (default: progress and a table)"
+    add("-q", "--quiet", action="store_true", help=help)
+    _add_precision(command)
+
+
+def _add_json(command: argparse.ArgumentParser, what: str) -> None:
+    command.add_argument(
+        "--json", metavar="FILE", help=f"write {what}, - for standard output (default: none)"
+    )
+
+
+def _add_motion_options(command: argparse.ArgumentParser) -> None:
+    add = command.add_argument
     choices = ("slide", "planar", "fixed")
     help = "boundary nodes slide on faces and edges, planar: on flat and straight ones only, or are fixed"
     add("--boundary", choices=choices, default="planar", help=f"{help} (default: planar)")
@@ -94,14 +127,12 @@ def _add_run_options(command: argparse.ArgumentParser) -> None:
     add("--surface-tolerance", type=float, default=0.01, metavar="PART", help=help)
     help = "hold the nodes of elements stretched beyond A, a number above 1 (default: none)"
     add("--freeze-aspect", type=float, default=None, metavar="A", help=help)
-    help = "hold the nodes of a named set; repeatable (default: none but those that the file marks)"
-    add("--fix", action="append", default=[], metavar="NAME", help=help)
+    help = (
+        "hold nodes: the name of a set, DATA=TAG for those of cells or nodes with this tag, or numbers from "
+        "0 such as 0-9,20; repeatable (default: none but those that the file marks)"
+    )
+    add("--fix", action="append", default=[], metavar="WHICH", help=help)
     help = (
         "move the nodes of opposite faces together, along axes such as xy (default: as the file links them)"
     )
     add("--periodic", default=None, metavar="AXES", help=help)
-    help = "write history and timings, - for standard output (default: none)"
-    add("--json", metavar="FILE", help=help)
-    help = "print only errors, what OUT can't hold, and what stays inverted (default: progress and a table)"
-    add("-q", "--quiet", action="store_true", help=help)
-    _add_precision(command)

@@ -315,15 +315,14 @@ def test_the_help_names_every_method():
 
 
 def test_the_help_says_the_defaults():
-    from jaxsmooth.cli import _COMMANDS
     from jaxsmooth.methods.optimize.goals import GOALS
     from jaxsmooth.options import GOALS as NAMES
     from jaxsmooth.options import parser
 
     assert list(GOALS) == list(NAMES)
-    (commands,) = (a.choices for a in parser(_COMMANDS)._actions if a.choices)
+    (commands,) = (a.choices for a in parser()._actions if a.choices)
     for command in commands.values():
-        options = [a for a in command._actions if (a.option_strings or a.nargs) and a.dest != "help"]
+        options = [a for a in command._actions if (a.option_strings or a.nargs == "?") and a.dest != "help"]
         assert [a.dest for a in options if "(default: " not in (a.help or "")] == []
         for action in options:
             if isinstance(action.default, str):

@@ -197,14 +197,14 @@ def test_the_command_line_copies_too(tmp_path, capsys):
 
 def test_what_is_said_on_the_coordinates_is_said_at_the_end(made, tmp_path, capsys, monkeypatch):
     """The trial before the work changes no coordinate, so it rounds none."""
-    from jaxsmooth import cli
+    from jaxsmooth import choices, cli
 
     def run(file, *args):
         result = smooth(file, *args)
         return dataclasses.replace(result, mesh=file.mesh.with_points(jnp.asarray(moved(file))))
 
-    smooth = cli._run
-    monkeypatch.setattr(cli, "_run", run)
+    smooth = choices.run_method
+    monkeypatch.setattr(choices, "run_method", run)
     words = ["smooth", str(made("hand-fields.nas")), str(tmp_path / "a.nas"), "--steps", "0", "-q"]
     assert cli.main([*words, "--json", str(tmp_path / "a.json")]) == 0
     assert capsys.readouterr().err.count("fields of 8 columns round coordinates by at most") == 1

@@ -17,7 +17,19 @@ ORDER = (
         "targets",
         "methods",
     ),
-    *("runs", "files", "adaptors", "report", "demo", "cache", "options", "cli", "__main__"),
+    *(
+        "runs",
+        "files",
+        "adaptors",
+        "report",
+        "demo",
+        "cache",
+        "options",
+        "choices",
+        "commands",
+        "cli",
+        "__main__",
+    ),
 )
 LINES, FUNCTION = 400, 60
 

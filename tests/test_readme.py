@@ -83,18 +83,14 @@ def test_the_code_of_contributing_runs(part):
     assert js.element_type("triangle7").facets[0].type is js.element_type("line3")
 
 
-def command_line():
-    return parser(dict.fromkeys(("smooth", "quality", "compare", "demo"), lambda *_: 0))
-
-
 def test_commands_parse():
     """All calls of `jaxsmooth` in shell blocks, with the options that they use."""
     code = "".join(code for name in PAPERS for _, code in blocks(name, "sh"))
     words = [shlex.split(command, comments=True) for command in re.split(r"\n|&&", code)]
     calls = [line[1:] for line in words if line and Path(line[0]).name == "jaxsmooth"]
-    assert len(calls) == len(re.findall(r"jaxsmooth (?:smooth|quality|compare|demo)", code)) >= 7
+    assert len(calls) == len(re.findall(r"jaxsmooth (?:smooth|quality|info|compare|demo)", code)) >= 7
     for call in calls:
-        options = command_line().parse_args(call)
+        options = parser().parse_args(call)
         assert getattr(options, "method", "elastic") in METHODS
         assert set(getattr(options, "metric", [])) <= set(js.METRICS)
 
@@ -112,7 +108,7 @@ def test_options_exist(name):
     for language in ("sh", "python"):
         for _, code in blocks(name, language):
             words = words.replace(code, "")
-    commands = next(a for a in command_line()._actions if a.choices).choices.values()
+    commands = next(a for a in parser()._actions if a.choices).choices.values()
     known = {option for command in commands for option in command._option_string_actions}
     assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", words)) <= known
 

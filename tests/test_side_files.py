@@ -284,7 +284,7 @@ STAGES = {
     "writing the mesh": ("jaxsmooth.files.io.patch_file", False),
     "making the report": ("jaxsmooth.report.page.html_page", False),
     "printing the table": ("jaxsmooth.report.report.print_comparison", False),
-    "saying so": ("jaxsmooth.cli._finish", True),
+    "saying so": ("jaxsmooth.commands._finish", True),
 }
 
 

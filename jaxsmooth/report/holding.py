@@ -51,8 +51,8 @@ class Holding:
         return ", ".join(parts)
 
 
-def holding(mesh: Mesh, motion: Motion) -> Holding:
-    """The reasons of all nodes of a mesh, at its points."""
+def holding(mesh: Mesh, motion: Motion, asked: np.ndarray | None = None) -> Holding:
+    """The reasons of all nodes of a mesh at its points; an option holds those `asked` for ``[nodes]``."""
     admissible = motion.at(mesh.points)
     freedom, facets = admissible.freedom, find_facets(mesh)
     dim, count = mesh.dim, len(mesh.points)
@@ -69,7 +69,16 @@ def holding(mesh: Mesh, motion: Motion) -> Holding:
     if mesh.labels is not None and mesh.labels.held is not None:
         marked = np.asarray(mesh.labels.held)
     layers = layer_nodes(mesh, facets) if held.any() else held
-    chain = ((marked, 4), (layers, 5), (outer & edge, 6), (outer & flat, 8), (outer, 7), (between, 9))
+    asked = np.zeros(count, bool) if asked is None else asked
+    chain = (
+        (asked, 10),
+        (marked, 4),
+        (layers, 5),
+        (outer & edge, 6),
+        (outer & flat, 8),
+        (outer, 7),
+        (between, 9),
+    )
     rest = held.copy()
     for mask, code in chain:
         reason[rest & mask] = code

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxsmooth.cells.table import element_type
-from jaxsmooth.convert.meshfile import MeshFile
+from jaxsmooth.convert.meshfile import MeshFile, to_meshio
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.metrics.record import Metric
 from jaxsmooth.metrics.table import METRICS, USUAL, named, quality
@@ -21,6 +21,7 @@ from jaxsmooth.metrics.validity import inverted
 
 __all__ = [
     "cell_data",
+    "centroids",
     "chosen_metrics",
     "csv_text",
     "histogram",
@@ -185,16 +186,18 @@ def worst(metric: Metric, parts: Sequence[np.ndarray], count: int = _WORST) -> l
 def _print_worst(out: Console, file: MeshFile, metric: Metric, parts: Sequence[np.ndarray]) -> None:
     """The worst elements by a metric, with their place."""
     out.print(f"\nworst by {metric.name} (numbered from 0 in their type)")
-    places = _centroids(file)
+    places = centroids(file)
     for block, element, value in worst(metric, parts):
         name = file.mesh.types[block]
         place = ", ".join(f"{x:.6g}" for x in places[block][element])
         out.print(f"{name:>12} {element:>9} {value:>11.4g}   at ({place})")
 
 
-def _centroids(file: MeshFile) -> list[np.ndarray]:
-    """Means of the corners ``[elements, dim]`` of every block, in the coordinates of the file."""
-    points = np.asarray(file.source.points, np.float64)
+def centroids(file: MeshFile, mesh: Mesh | None = None) -> list[np.ndarray]:
+    """Means of the corners ``[elements, dim]`` of every block: in the file, or of a mesh in its place."""
+    points = np.asarray(
+        file.source.points if mesh is None else to_meshio(file, mesh.points).points, np.float64
+    )
     corners = [
         np.asarray(nodes)[:, : element_type(name).corners]
         for name, nodes in zip(file.mesh.types, file.mesh.connectivity, strict=True)
@@ -207,7 +210,7 @@ def _centroids(file: MeshFile) -> list[np.ndarray]:
 
 def csv_text(file: MeshFile, values: Values) -> str:
     """A row an element: type, number in it from 0, region, centroid, metrics; empty where there is none."""
-    mesh, places = file.mesh, _centroids(file)
+    mesh, places = file.mesh, centroids(file)
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     axes = ("x", "y", "z")[: places[0].shape[1]]

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -222,6 +223,21 @@ def print_step(out: Console, row: StepRecord) -> None:
         f"step {row.step:2d}  q_min {s.q_min:7.4f}  q_avg {s.q_avg:7.4f}  below 0.2 {s.below:6d}"
         f"  inverted {s.inverted:5d}{solver}  {row.seconds:6.2f} s"
     )
+
+
+def print_done(out: Console, row: dict[str, Any]) -> None:
+    """One line for one of several files: its row of the JSON."""
+    first, last = row["steps"][0], row["steps"][-1]
+    numbers = "  ".join(
+        f"{label} {first[key]:{form}} → {last[key]:{form}}"
+        for key, label, form in (
+            ("q_min", "q_min", ".4f"),
+            ("q_avg", "q_avg", ".4f"),
+            ("q_below_0.2", "below 0.2", "d"),
+        )
+    )
+    remain = f"  inverted {last['inverted']:,}" if last["inverted"] else ""
+    out.print(f"{Path(row['input']).name}: {numbers}{remain}")
 
 
 _ROWS = (

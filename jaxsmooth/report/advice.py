@@ -1,0 +1,80 @@
+"""What a user can do: what holds the nodes, which elements stay worst, what would help."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from jaxsmooth.convert.meshfile import MeshFile
+from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.metrics.summary import POOR, evaluated
+from jaxsmooth.report.holding import Holding
+from jaxsmooth.report.quality import centroids
+
+__all__ = ["print_held", "print_worst", "worst_elements"]
+
+_MOSTLY = 0.5  # part of the nodes that are held, from which on advice is given
+_HINTS = {
+    "held: by the file": "the file marks them: take the mark off there to free them",
+    "held: boundary layer": "in Python, detect_constraints(…, layers='free') frees the layer",
+    "held: curved boundary": "--boundary slide lets them slide on their curved faces",
+    "held: edge or corner": "--feature-angle DEG decides what is an edge",
+    "held: flat boundary": "--boundary planar lets them slide on their flat faces",
+    "held: between regions": "--interfaces slide lets them slide between the materials",
+    "held: by an option": "leave out --fix, --freeze-aspect or --boundary fixed to free them",
+}
+_LISTED = 5
+
+
+def held_counts(held: Holding) -> dict[str, int]:
+    """Numbers of held nodes by reason, the most frequent first."""
+    counts = {name: number for name, number in held.counts() if name in _HINTS}
+    return dict(sorted(counts.items(), key=lambda item: -item[1]))
+
+
+def print_held(out: Console, held: Holding) -> None:
+    """What holds the nodes; where that is most of them, how to free those of the most frequent reason."""
+    counts = held_counts(held)
+    if not counts:
+        return
+    parts = [f"{number:,} {name.removeprefix('held: ')}" for name, number in counts.items()]
+    out.print(f"held: {', '.join(parts)}")
+    if sum(counts.values()) > _MOSTLY * len(held.reason):
+        name, number = next(iter(counts.items()))
+        reason = name.removeprefix("held: ")
+        out.print(
+            f"  most nodes are held, {number:,} of them by {reason!r}:\n  {_HINTS[name]}", style="yellow"
+        )
+
+
+def worst_elements(file: MeshFile, mesh: Mesh, held: Holding, count: int = _LISTED) -> list[dict[str, Any]]:
+    """The elements of least quality that are poor, with their place and what their nodes may do.
+
+    Args:
+        file: what was read.
+        mesh: the mesh now, in the order of the file.
+        held: of its nodes.
+        count: of elements at the most.
+    """
+    rows = []
+    for kind, q, nodes, places in zip(
+        mesh.types, evaluated(mesh).quality, mesh.connectivity, centroids(file, mesh), strict=True
+    ):
+        q = np.asarray(q, np.float64)
+        for element in np.argsort(q, kind="stable")[:count]:
+            if q[element] < POOR:
+                row = {"type": kind, "element": int(element), "q": float(q[element])}
+                place = [float(x) for x in places[element]]
+                rows.append({**row, "place": place, "nodes": held.of(np.asarray(nodes)[element])})
+    return sorted(rows, key=lambda row: row["q"])[:count]
+
+
+def print_worst(out: Console, rows: list[dict[str, Any]]) -> None:
+    """One line an element, if there are any."""
+    if rows:
+        out.print("worst elements (numbered from 0 in their type), and their nodes:")
+    for row in rows:
+        place = ", ".join(f"{x:.4g}" for x in row["place"])
+        out.print(f"{row['type']:>10} {row['element']:>8}  q {row['q']:7.4f}  at ({place}): {row['nodes']}")
