@@ -13,7 +13,9 @@ import numpy as np
 from jaxsmooth.convert.chosen import chosen_nodes
 from jaxsmooth.convert.meshfile import MeshFile
 from jaxsmooth.convert.periodic import find_periodic
+from jaxsmooth.files.formats.record import stem_format
 from jaxsmooth.files.formats.table import FORMATS, format_named, format_of_suffix
+from jaxsmooth.mesh.layers import nodes_of, stretched
 from jaxsmooth.methods import METHODS, Method, Optimize
 from jaxsmooth.motion import detect
 from jaxsmooth.motion.base import Motion
@@ -24,6 +26,7 @@ __all__ = [
     "check_run_options",
     "chosen_method",
     "constraints_of",
+    "format_for",
     "held_by_option",
     "inputs_of",
     "output_name",
@@ -56,11 +59,13 @@ def check_run_options(options: argparse.Namespace) -> None:
 
 
 def held_by_option(file: MeshFile, options: argparse.Namespace) -> np.ndarray:
-    """The nodes ``[nodes]`` that ``--fix`` names."""
+    """The nodes ``[nodes]`` that ``--fix`` and ``--freeze-aspect`` hold."""
     held = np.zeros(len(file.mesh.points), bool)
     for word in options.fix:
         if word != "fixed" or not file.fixed.any():  # a file's own mark is heeded anyway
             held |= chosen_nodes(file, word)
+    if options.freeze_aspect is not None:
+        held |= nodes_of(file.mesh, stretched(file.mesh, options.freeze_aspect))
     return held
 
 
@@ -74,6 +79,7 @@ def constraints_of(file: MeshFile, options: argparse.Namespace) -> Motion:
         mesh,
         boundary=options.boundary,
         interfaces=options.interfaces,
+        layers=options.layers,
         feature_angle=options.feature_angle,
         surface_tolerance=options.surface_tolerance,
         fixed=file.fixed | held_by_option(file, options),
@@ -87,6 +93,13 @@ def run_method(
     """A run of exactly so many steps, or until it has converged."""
     exactly = {} if steps is None else {"steps": steps, "tolerance_avg": 0.0}
     return driver.smooth(file.mesh, method, constraints=constraints, callback=callback, **exactly)
+
+
+def format_for(asked: str | None, old: str | None) -> str | None:
+    """The format that was asked for: the input's own kind of it where the input is of that format."""
+    if asked is None or ":" in asked:
+        return asked
+    return old if old is not None and stem_format(old) == asked else FORMATS[asked].full_name()
 
 
 def inputs_of(words: list[str]) -> list[Path]:

@@ -9,7 +9,7 @@ import sys
 from importlib import import_module
 
 from jaxsmooth.files.outputs import Outputs, ending
-from jaxsmooth.options import parser
+from jaxsmooth.options import check, parse
 from jaxsmooth.report.terminal import close_standard_output, complain, prepare_streams, sentence
 
 __all__ = ["main"]
@@ -25,7 +25,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     Returns:
         The exit code: 0 done; 2 bad input or usage, nothing written; 3 done, but inverted elements
-        remain; 130 interrupted.
+        remain; 4 some of several meshes failed, the others are written; 130 interrupted.
     """
     prepare_streams()
     outputs = Outputs()
@@ -34,7 +34,7 @@ def main(arguments: list[str] | None = None) -> int:
         program = ending(lambda: _interrupted(outputs), INTERRUPTED)
     try:
         with program, outputs:
-            return _run_command(parser().parse_args(arguments), outputs)
+            return _run_command(parse(arguments), outputs)
     except KeyboardInterrupt:
         _interrupted(outputs)
         return INTERRUPTED
@@ -44,13 +44,13 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _interrupted(outputs: Outputs) -> None:
     outputs.discard()
-    written = f"all was done, and {', '.join(outputs.written)} written" if outputs.written else ""
-    complain(f"interrupted; {written or 'nothing was written'}")
+    written = f" after {', '.join(outputs.written)} had been written" if outputs.written else ""
+    complain(f"interrupted{written or '; nothing was written'}")
 
 
 def _run_command(options: argparse.Namespace, outputs: Outputs) -> int:
     try:
-        _check_input(options)
+        check(options)
         _set_up_jax(options)
         return getattr(import_module("jaxsmooth.commands"), options.command)(options, outputs)
     except Exception as error:
@@ -59,21 +59,6 @@ def _run_command(options: argparse.Namespace, outputs: Outputs) -> int:
             raise
         complain(text)
         return BAD_INPUT
-
-
-def _check_input(options: argparse.Namespace) -> None:
-    """A file that is not there is missed at once, before JAX is loaded."""
-    words = [getattr(options, "input", None), *getattr(options, "files", ())]
-    if getattr(options, "files", None) and options.out_dir is None:
-        if len(options.files) != 2:
-            raise ValueError(
-                f"smooth takes IN and OUT, or any number of inputs with --out-dir DIR; got "
-                f"{len(options.files)} files"
-            )
-        words.pop()
-    for path in words:
-        if path is not None and not os.path.exists(path):
-            raise FileNotFoundError(f"{path}: there is no such file; check the name")
 
 
 def _set_up_jax(options: argparse.Namespace) -> None:

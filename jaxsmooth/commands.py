@@ -18,14 +18,15 @@ from jaxsmooth.files.formats.table import format_of_suffix
 from jaxsmooth.files.outputs import Outputs
 from jaxsmooth.methods import METHODS
 from jaxsmooth.metrics.table import USUAL
+from jaxsmooth.motion.detect import detect_constraints
 from jaxsmooth.report import advice, quality, report
 from jaxsmooth.report.holding import holding
 from jaxsmooth.report.terminal import complain, sentence, write_to_standard_output
 from jaxsmooth.runs.driver import SmoothResult
 
-__all__ = ["DONE", "INVERTED", "SOME_FAILED", "compare", "demo", "info", "measure", "smooth"]
+__all__ = ["BAD_INPUT", "DONE", "INVERTED", "SOME_FAILED", "compare", "demo", "info", "measure", "smooth"]
 
-DONE, SOME_FAILED, INVERTED = 0, 2, 3
+DONE, BAD_INPUT, INVERTED, SOME_FAILED = 0, 2, 3, 4
 
 
 # --- smooth ----------------------------------------------------------------------------
@@ -77,10 +78,12 @@ def _smooth_one(
     options: argparse.Namespace, source: Path, target: Path, out: Console, outputs: Outputs
 ) -> _Done:
     """From file to file; the output is put in place when the outputs are committed."""
-    clock, asked = report.Clock(), {"file_format": options.format, "force": options.force}
+    clock = report.Clock()
     with clock("read"):
         file = io.read(source)
-    io.check_types(file.mesh.types, target, io.output_format(target, file, options.format))
+    asked: dict[str, Any] = {"file_format": choices.format_for(options.format, file.format)}
+    asked["force"] = options.force
+    io.check_types(file.mesh.types, target, io.output_format(target, file, asked["file_format"]))
     report.print_file(out, file)
     with clock("write"), Outputs() as trial:  # what a writer refuses, it refuses before the work
         notes = io.write_to(trial, target, file, **asked)
@@ -105,9 +108,14 @@ def _smooth_one(
     report.print_comparison(out, file.mesh, result)
     worst = advice.worst_elements(file, result.mesh, held)
     advice.print_worst(out, worst)
-    notes = (*file.notes, *notes, *late)
+    losses, notes = [*notes, *late], (*file.notes, *notes, *late)
     row = report.as_json(str(source), str(target), options.method, result, clock.split(), notes)
-    row |= {"node_freedom": dict(held.counts()), "worst": worst}
+    row |= {
+        "node_freedom": dict(held.counts()),
+        "advice": advice.advice(held),
+        "worst": worst,
+        "losses": losses,
+    }
     return _Done(file, result, row, clock.seconds)
 
 
@@ -132,13 +140,13 @@ def _smooth_several(options: argparse.Namespace, outputs: Outputs) -> int:
         for source, target in zip(sources, targets, strict=True):
             progress.update(task, description=source.name)
             try:
-                with Outputs() as own:
-                    done = _smooth_one(options, source, target, report.console(quiet=True), own)
-                    own.commit()
+                done = _smooth_one(options, source, target, report.console(quiet=True), outputs)
+                outputs.commit()
             except Exception as error:
                 text = sentence(error)
                 if text is None:
                     raise
+                outputs.discard()
                 complain(text if str(source) in text else f"{source}: {text}")
                 failed += 1
                 rows.append({"input": str(source), "output": None, "error": text})
@@ -151,14 +159,17 @@ def _smooth_several(options: argparse.Namespace, outputs: Outputs) -> int:
         _write_json(outputs, options.json, {"files": rows})
         outputs.commit()
     out.print(f"{len(sources) - failed:,} of {len(sources):,} files written to {folder}")
-    return SOME_FAILED if failed else INVERTED if tangled else DONE
+    if failed:
+        return SOME_FAILED if failed < len(sources) else BAD_INPUT
+    return INVERTED if tangled else DONE
 
 
 def _write_report(outputs: Outputs, options: argparse.Namespace, source: Path, done: _Done) -> None:
     from jaxsmooth.report.page import html_page
 
-    left_out = ("command", "files", "json", "report", "quiet", "force", "precision", "no_cache")
-    settings = {name.replace("_", " "): v for name, v in vars(options).items() if name not in left_out}
+    left_out = ("command", "files", "out_dir", "json", "report", "quiet", "force", "precision", "no_cache")
+    settings = {"input": source, "output": options.files[1]}
+    settings |= {name.replace("_", " "): v for name, v in vars(options).items() if name not in left_out}
     more = {"settings": settings, "seconds": done.row["seconds"], "notes": done.file.notes}
     outputs.text(options.report, html_page(source.name, done.file.mesh, done.result, **more))
 
@@ -176,18 +187,22 @@ def measure(options: argparse.Namespace, outputs: Outputs) -> int:
     file = io.read(options.input)
     values = quality.measured(file.mesh, quality.chosen_metrics(names, file.mesh))
     rows = quality.quality_rows(file.mesh, values)
-    out = report.console(quiet=options.json == "-")
+    metric, parts = next(iter(values.items()))
+    held = holding(file.mesh, detect_constraints(file))
+    worst = quality.worst_rows(file, metric, parts, held)
+    out, losses = report.console(quiet=options.json == "-"), ()
     report.print_file(out, file)
-    quality.print_report(out, file, values, rows)
+    quality.print_report(out, values, rows, worst)
     if options.csv is not None:
         outputs.text(options.csv, quality.csv_text(file, values))
     if options.quality_data is not None:
-        notes = io.write_to(
+        losses = io.write_to(
             outputs, options.quality_data, file, cell_data=quality.cell_data(file.mesh, values)
         )
-        _print_losses(out, notes, options.quality_data)
+        _print_losses(out, losses, options.quality_data)
     if options.json is not None:
-        content = {"input": options.input, **report.counts(file.mesh), "quality": rows, "notes": file.notes}
+        content = {"input": options.input, **report.counts(file.mesh), "quality": rows, "worst": worst}
+        content |= {"notes": [*file.notes, *losses], "losses": losses}
         _write_json(outputs, options.json, content)
     if options.json or options.csv or data:
         _finish(out, outputs, "wrote {}")

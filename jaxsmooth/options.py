@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import difflib
+import os
+from collections.abc import Sequence
 
 from jaxsmooth import __version__
 
-__all__ = ["GOALS", "METHODS", "parser"]
+__all__ = ["GOALS", "METHODS", "check", "parse", "parser"]
 
 METHODS = (
     "elastic, elastic-extended, laplacian, smart-laplacian, weighted-laplacian, smart-weighted-laplacian, "
@@ -15,13 +18,70 @@ METHODS = (
 GOALS = ("average", "worst", "balanced")
 
 
+def parse(words: Sequence[str] | None) -> argparse.Namespace:
+    """The options of a command line; the process ends with a sentence where they are none."""
+    root = parser()
+    options, rest = root.parse_known_args(words)
+    unknown = [word for word in rest if word.startswith("-")]
+    if unknown or (rest and not hasattr(options, "files")):
+        word = (unknown or rest)[0]
+        near = difflib.get_close_matches(
+            word.partition("=")[0], _known(root, options.command), n=2, cutoff=0.6
+        )
+        hint = f"did you mean {' or '.join(near)}?" if near else "see --help"
+        root.error(f"unknown option {word}; {hint}" if unknown else f"one word too many, {word}; {hint}")
+    if rest:  # files that stand behind an option
+        options.files += rest
+    return options
+
+
+def check(options: argparse.Namespace) -> None:
+    """What can be seen without loading JAX: missing inputs, methods that there are not.
+
+    Raises:
+        ValueError: for a method.
+        FileNotFoundError: for an input.
+    """
+    asked = getattr(options, "methods", None)
+    names = asked.split(",") if asked is not None else [getattr(options, "method", "elastic")]
+    for name in map(str.strip, names):
+        if name not in (known := METHODS.split(", ")):
+            near = difflib.get_close_matches(name, known, n=2, cutoff=0.4)
+            hint = f"did you mean {' or '.join(near)}?" if near else f"known are {METHODS}"
+            raise ValueError(f"unknown method {name!r}; {hint}")
+    words = getattr(options, "metric", [])  # its last one may be the file
+    path = getattr(options, "input", None) or (words[-1] if len(words) > 1 else None)
+    paths = [] if path is None else [path]
+    files = getattr(options, "files", [])
+    if files and options.out_dir is None:
+        if len(files) != 2:
+            raise ValueError(
+                f"smooth needs IN and OUT, got {len(files)} names; for several meshes add --out-dir DIR"
+            )
+        if os.path.isdir(files[0]):
+            raise ValueError(f"{files[0]}: this is a folder; to smooth all meshes in it add --out-dir DIR")
+        paths = files[:1]
+    elif files and not any(map(os.path.exists, files)):
+        paths = files[:1]
+    for path in paths:
+        if not os.path.exists(path):
+            raise FileNotFoundError(f"{path}: there is no such file; check the name")
+
+
+def _known(root: argparse.ArgumentParser, name: str) -> list[str]:
+    """The options of a command."""
+    choices = next(action.choices for action in root._actions if action.choices)
+    command = choices["quality" if name == "measure" else name]  # pyright: ignore[reportIndexIssue, reportCallIssue, reportArgumentType]
+    return list(command._option_string_actions)
+
+
 def parser() -> argparse.ArgumentParser:
     """The parser; the options of a command name its function in `jaxsmooth.commands`."""
     root = argparse.ArgumentParser(
         prog="jaxsmooth",
         description="Improve finite-element meshes by moving their nodes.",
-        epilog="exit codes: 0 done; 2 bad input or usage, nothing written; "
-        "3 done, but inverted elements remain; 130 interrupted",
+        epilog="exit codes: 0 done; 2 bad input or usage, nothing written; 3 done, but inverted elements "
+        "remain; 4 some of several meshes failed, the others are written; 130 interrupted",
     )
     root.add_argument("--version", action="version", version=f"jaxsmooth {__version__}")
     commands = root.add_subparsers(required=True, metavar="COMMAND")
@@ -121,6 +181,8 @@ def _add_motion_options(command: argparse.ArgumentParser) -> None:
     add("--boundary", choices=choices, default="planar", help=f"{help} (default: planar)")
     help = "the same for the nodes between materials (default: planar)"
     add("--interfaces", choices=choices, default="planar", help=help)
+    help = "the nodes of boundary layers: hold them, or free (default: hold)"
+    add("--layers", choices=("hold", "free"), default="hold", help=help)
     help = "folds sharper than this are edges (default: 50; with planar 0: all straight ones)"
     add("--feature-angle", type=float, default=None, metavar="DEG", help=help)
     help = "distance that nodes keep to the facets of the input, over the length of edges (default: 0.01)"
@@ -128,8 +190,8 @@ def _add_motion_options(command: argparse.ArgumentParser) -> None:
     help = "hold the nodes of elements stretched beyond A, a number above 1 (default: none)"
     add("--freeze-aspect", type=float, default=None, metavar="A", help=help)
     help = (
-        "hold nodes: the name of a set, DATA=TAG for those of cells or nodes with this tag, or numbers from "
-        "0 such as 0-9,20; repeatable (default: none but those that the file marks)"
+        "hold nodes: the name of a set, DATA=TAG or DIMENSION:TAG for those of cells with this tag, or "
+        "numbers from 0 such as 0-9,20; repeatable (default: none but those that the file marks)"
     )
     add("--fix", action="append", default=[], metavar="WHICH", help=help)
     help = (

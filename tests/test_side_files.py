@@ -304,7 +304,7 @@ def test_interrupts(stage, part, out, capsys, monkeypatch):
     error = one_sentence(capsys, "interrupted")
     if done:
         assert sorted(content(out)) == ["a.html", "a.json", "a.vtu"]
-        assert "all was done" in error
+        assert "had been written" in error
         assert "a.html" in error
     else:
         assert content(out) == {"a.vtu": b"old"}

@@ -7,9 +7,11 @@ import re
 
 import numpy as np
 
+from jaxsmooth.cells.table import TYPES
 from jaxsmooth.convert.meshfile import MeshFile
+from jaxsmooth.convert.regions import plain, region_arrays
 
-__all__ = ["chosen_nodes"]
+__all__ = ["chosen_nodes", "tags_of"]
 
 _RANGE = re.compile(r"\d+(-\d+)?(,\d+(-\d+)?)*")
 
@@ -20,13 +22,16 @@ def chosen_nodes(file: MeshFile, word: str) -> np.ndarray:
     Args:
         file: what was read.
         word: the name of a set; ``DATA=TAG``, the nodes, or the nodes of the cells, whose data of this name
-            is TAG (several are joined by commas); or numbers of nodes, counted from 0: ``"0-9,20"``.
+            is TAG (several are joined by commas); ``2:7``, the nodes of faces with tag 7, and so for other
+            dimensions; or numbers of nodes, counted from 0: ``"0-9,20"``.
 
     Raises:
         ValueError: no such set, data, tag or node.
     """
     if word in file.named_sets:
         return np.asarray(file.named_sets[word])
+    if found := re.fullmatch(r"([0-3]):(-?\d+)", word):
+        return _of_dimension(file, word, int(found[1]), int(found[2]))
     name, equals, tags = word.rpartition("=")
     if equals:
         return _tagged(file, name, tags)
@@ -36,6 +41,17 @@ def chosen_nodes(file: MeshFile, word: str) -> np.ndarray:
     known = ", ".join(file.named_sets) or "none"
     hint = f"did you mean {' or '.join(near)}?" if near else f"the file has {known}"
     raise ValueError(f"unknown set {word!r}; {hint}; a tag is written as DATA=TAG, nodes as 0-9")
+
+
+def _of_dimension(file: MeshFile, word: str, dim: int, tag: int) -> np.ndarray:
+    known, mask = tags_of(file), np.zeros(len(file.mesh.points), bool)
+    found = [nodes for (d, _, number), nodes in known.items() if (d, number) == (dim, tag)]
+    if not found:
+        there = ", ".join(f"{d}:{number}" for d, _, number in list(known)[:12]) or "none"
+        raise ValueError(f"{word}: no cells have this tag; the file has {there} (dimension:tag)")
+    for nodes in found:
+        mask[nodes] = True
+    return mask
 
 
 def _numbered(word: str, count: int) -> np.ndarray:
@@ -74,3 +90,26 @@ def _has(values: object, tags: list[float]) -> np.ndarray:
     if values.dtype.kind not in "iufb":
         return np.zeros(len(values), bool)
     return np.any(np.isin(values.reshape(len(values), -1).astype(float), tags), axis=1)
+
+
+def tags_of(file: MeshFile) -> dict[tuple[int, str, int], np.ndarray]:
+    """Nodes of the cells of every tag: by the dimension of the cells, the name of the array and the tag.
+
+    Of each dimension the first array with a usual name counts that has any tags (`REGION_NAMES`)."""
+    cells, found = file.source.cells, {}
+    for dim in (3, 2, 1, 0):
+        blocks = [k for k, part in enumerate(cells) if len(part) and _dimension(part.type) == dim]
+        for name, tags in region_arrays(file.source, blocks):
+            if not any(part.any() for part in tags.values()):
+                continue
+            for tag in np.unique(np.concatenate([*tags.values()])).tolist():
+                rows = [plain(cells[k].data)[part == tag].ravel() for k, part in tags.items()]
+                found[dim, name, tag] = np.unique(np.concatenate(rows))
+            break
+    return found
+
+
+def _dimension(name: str) -> int | None:
+    if name == "vertex":
+        return 0
+    return TYPES[name].dim if name in TYPES else None

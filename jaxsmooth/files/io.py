@@ -14,7 +14,7 @@ from typing import Any
 from jaxsmooth.convert.meshfile import MeshFile, MeshFileError, as_file, as_mesh, from_meshio, to_meshio
 from jaxsmooth.convert.original import Original
 from jaxsmooth.files.formats.record import Patched, UnpatchableError, stem_format
-from jaxsmooth.files.formats.table import format_of_suffix
+from jaxsmooth.files.formats.table import format_named, format_of_suffix
 from jaxsmooth.files.outputs import Outputs
 from jaxsmooth.files.patching import patch_file
 from jaxsmooth.files.reading import MissingFileError, read_source
@@ -132,7 +132,9 @@ def write_to(
         points = getattr(points, attribute, points)
     mesh = to_meshio(file, points, point_data=point_data, cell_data=cell_data)
     patched, notes = None, []
-    if not point_data and not cell_data:
+    if point_data or cell_data:
+        notes += _lost_by_data(file, name, path)
+    else:
         try:
             patched = patch_file(file, mesh.points, path, name)
         except UnpatchableError as error:
@@ -156,6 +158,17 @@ def write_to(
     except OSError as error:
         raise _unwritable(path, error) from error
     return tuple(notes)
+
+
+def _lost_by_data(file: MeshFile, name: str, path: Path) -> list[str]:
+    """A note where the input could have been copied but for the data that are added."""
+    record = format_named(name)
+    if file.original is None or name != file.format or record is None or record.patch is None:
+        return []
+    return [
+        f"{path.name} is written anew, without what is neither mesh, nor data, nor sets, "
+        "because data are added"
+    ]
 
 
 def _write_patched(outputs: Outputs, part: Path, patched: Patched) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -13,17 +14,17 @@ from jaxsmooth.metrics.summary import POOR, evaluated
 from jaxsmooth.report.holding import Holding
 from jaxsmooth.report.quality import centroids
 
-__all__ = ["print_held", "print_worst", "worst_elements"]
+__all__ = ["advice", "print_held", "print_worst", "worst_elements"]
 
 _MOSTLY = 0.5  # part of the nodes that are held, from which on advice is given
 _HINTS = {
-    "held: by the file": "the file marks them: take the mark off there to free them",
-    "held: boundary layer": "in Python, detect_constraints(…, layers='free') frees the layer",
+    "held: by the file": "the file marks them; take the mark off there",
+    "held: boundary layer": "--layers free lets them move",
     "held: curved boundary": "--boundary slide lets them slide on their curved faces",
     "held: edge or corner": "--feature-angle DEG decides what is an edge",
     "held: flat boundary": "--boundary planar lets them slide on their flat faces",
     "held: between regions": "--interfaces slide lets them slide between the materials",
-    "held: by an option": "leave out --fix, --freeze-aspect or --boundary fixed to free them",
+    "held: by an option": "leave out --fix, --freeze-aspect or --boundary fixed",
 }
 _LISTED = 5
 
@@ -34,19 +35,25 @@ def held_counts(held: Holding) -> dict[str, int]:
     return dict(sorted(counts.items(), key=lambda item: -item[1]))
 
 
+def advice(held: Holding) -> list[str]:
+    """Where most nodes are held: a line for each reason, the most frequent first, on how to free them."""
+    counts = held_counts(held)
+    if sum(counts.values()) <= _MOSTLY * len(held.reason):
+        return []
+    return [f"{n:,} {name.removeprefix('held: ')}: {_HINTS[name]}" for name, n in counts.items()]
+
+
 def print_held(out: Console, held: Holding) -> None:
-    """What holds the nodes; where that is most of them, how to free those of the most frequent reason."""
+    """What holds the nodes; where that is most of them, how to free them."""
     counts = held_counts(held)
     if not counts:
         return
     parts = [f"{number:,} {name.removeprefix('held: ')}" for name, number in counts.items()]
     out.print(f"held: {', '.join(parts)}")
     if sum(counts.values()) > _MOSTLY * len(held.reason):
-        name, number = next(iter(counts.items()))
-        reason = name.removeprefix("held: ")
-        out.print(
-            f"  most nodes are held, {number:,} of them by {reason!r}:\n  {_HINTS[name]}", style="yellow"
-        )
+        out.print("  most nodes are held:", style="yellow")
+    for line in advice(held):
+        out.print(f"  {line}", style="yellow")
 
 
 def worst_elements(file: MeshFile, mesh: Mesh, held: Holding, count: int = _LISTED) -> list[dict[str, Any]]:
@@ -72,9 +79,11 @@ def worst_elements(file: MeshFile, mesh: Mesh, held: Holding, count: int = _LIST
 
 
 def print_worst(out: Console, rows: list[dict[str, Any]]) -> None:
-    """One line an element, if there are any."""
+    """Two lines an element, if there are any."""
     if rows:
         out.print("worst elements (numbered from 0 in their type), and their nodes:")
     for row in rows:
         place = ", ".join(f"{x:.4g}" for x in row["place"])
-        out.print(f"{row['type']:>10} {row['element']:>8}  q {row['q']:7.4f}  at ({place}): {row['nodes']}")
+        out.print(f"{row['type']:>12} {row['element']:>9}  q {row['q']:7.4f}  at ({place})")
+        for line in wrap(f"nodes: {row['nodes']}", 64):
+            out.print(f"{'':>12} {line}", style="dim")

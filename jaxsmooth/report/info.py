@@ -8,15 +8,20 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from jaxsmooth.convert.chosen import tags_of
 from jaxsmooth.convert.meshfile import MeshFile
+from jaxsmooth.convert.regions import plain
 from jaxsmooth.mesh.topology import find_facets
 from jaxsmooth.metrics.summary import statistics
 from jaxsmooth.motion.base import Motion
-from jaxsmooth.report.advice import print_held
+from jaxsmooth.report.advice import advice, print_held
 from jaxsmooth.report.holding import Holding
 from jaxsmooth.report.report import counts, print_constraints, print_notes
 
 __all__ = ["facts", "print_facts"]
+
+
+_TAGS = 60  # that are printed; the JSON has all
 
 
 def facts(file: MeshFile, motion: Motion, held: Holding) -> dict[str, Any]:
@@ -35,11 +40,17 @@ def facts(file: MeshFile, motion: Motion, held: Holding) -> dict[str, Any]:
         "bounds": [points.min(axis=0).tolist(), points.max(axis=0).tolist()],
         "boundary_facets": int(sum((part.partner < 0).sum() for part in sides)),
         "regions": _regions(file),
+        "reversed": _reversed(file),
+        "tags": [
+            {"dimension": dim, "data": name, "tag": tag, "nodes": len(nodes)}
+            for (dim, name, tag), nodes in tags_of(file).items()
+        ],
         "sets": {name: int(np.sum(nodes)) for name, nodes in file.named_sets.items()},
         "point_data": {name: _shape(values) for name, values in source.point_data.items()},
         "cell_data": {name: _shape(values[0]) for name, values in source.cell_data.items() if len(values)},
         "linked_nodes": 0 if links is None else len(links.dependent),
         "node_freedom": dict(held.counts()),
+        "advice": advice(held),
         "quality": {
             "q_min": state.q_min,
             "q_avg": state.q_avg,
@@ -49,6 +60,20 @@ def facts(file: MeshFile, motion: Motion, held: Holding) -> dict[str, Any]:
         },
         "notes": list(file.notes),
     }
+
+
+def _reversed(file: MeshFile) -> dict[str, int]:
+    """Elements that the file numbers the other way round, by type."""
+    found = {}
+    for cells, (block, rows) in zip(file.source.cells, file.placement, strict=True):
+        if block < 0:
+            continue
+        there = rows >= 0
+        mine = np.asarray(file.mesh.connectivity[block])[rows[there]]
+        turned = int((mine != plain(cells.data)[there]).any(axis=1).sum())
+        name = file.mesh.types[block]
+        found[name] = found.get(name, 0) + turned
+    return {name: number for name, number in found.items() if number}
 
 
 def _shape(values: Any) -> str:
@@ -89,6 +114,13 @@ def print_facts(out: Console, file: MeshFile, motion: Motion, held: Holding, row
     table.add_row("from", ", ".join(f"{x:.6g}" for x in low))
     table.add_row("to", ", ".join(f"{x:.6g}" for x in high))
     table.add_row("boundary", f"{row['boundary_facets']:,} {'sides' if row['dim'] == 2 else 'faces'}")
+    turned = ", ".join(f"{number:,} {name}" for name, number in row["reversed"].items())
+    table.add_row("orientation", f"{turned} the other way round" if turned else "as usual")
+    table.add_row("linked", f"{row['linked_nodes']:,} nodes follow others")
+    if row["tags"]:
+        words = [f"{tag['dimension']}:{tag['tag']} ({tag['nodes']:,} nodes)" for tag in row["tags"]]
+        more = f", and {len(words) - _TAGS:,} more" if len(words) > _TAGS else ""
+        table.add_row("tags", ", ".join(words[:_TAGS]) + more)
     for title, key, unit in (("regions", "regions", "elements"), ("sets", "sets", "nodes")):
         if row[key]:
             table.add_row(title, ", ".join(f"{name} ({n:,} {unit})" for name, n in row[key].items()))

@@ -58,7 +58,6 @@ def html_page(
         seconds: of the phases, compilation apart.
         notes: what was found in the file.
     """
-    title = title.encode("utf-8", "replace").decode()  # names of files may be any bytes
     held = holding(before, result.constraints)
     drawn = scene(before, result.mesh, held)
     rows = drawn.pop("rows")
@@ -82,7 +81,8 @@ def html_page(
     page = (_ASSETS / "page.html").read_text()
     head, *parts = page.split("{{")
     pieces = [part.partition("}}") for part in parts]
-    return head + "".join(values[name] + rest for name, _, rest in pieces)
+    text = head + "".join(values[name] + rest for name, _, rest in pieces)
+    return text.encode("utf-8", "replace").decode()  # names of files may be any bytes
 
 
 def _verdict(before: Mesh, result: SmoothResult) -> str:

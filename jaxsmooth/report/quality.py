@@ -6,6 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.metrics.record import Metric
 from jaxsmooth.metrics.table import METRICS, USUAL, named, quality
 from jaxsmooth.metrics.validity import inverted
+from jaxsmooth.report.holding import Holding
 
 __all__ = [
     "cell_data",
@@ -27,9 +29,11 @@ __all__ = [
     "histogram",
     "measured",
     "print_report",
+    "print_worst",
     "quality_rows",
     "requested",
     "worst",
+    "worst_rows",
 ]
 
 Values = dict[Metric, tuple[np.ndarray, ...]]
@@ -101,12 +105,14 @@ def quality_rows(mesh: Mesh, values: Values) -> list[dict[str, Any]]:
     return rows
 
 
-def print_report(out: Console, file: MeshFile, values: Values, rows: list[dict[str, Any]]) -> None:
+def print_report(
+    out: Console, values: Values, rows: list[dict[str, Any]], worst: list[dict[str, Any]]
+) -> None:
     """The table, and of the first metric the histogram and the worst elements."""
     _print_table(out, rows)
     metric, parts = next(iter(values.items()))
     _print_histogram(out, metric, parts)
-    _print_worst(out, file, metric, parts)
+    print_worst(out, metric, worst)
 
 
 def _print_table(out: Console, rows: list[dict[str, Any]]) -> None:
@@ -183,14 +189,32 @@ def worst(metric: Metric, parts: Sequence[np.ndarray], count: int = _WORST) -> l
     return [(int(block[i]), int(element[i]), float(values[i])) for i in first if not np.isnan(values[i])]
 
 
-def _print_worst(out: Console, file: MeshFile, metric: Metric, parts: Sequence[np.ndarray]) -> None:
-    """The worst elements by a metric, with their place."""
+def worst_rows(
+    file: MeshFile, metric: Metric, parts: Sequence[np.ndarray], held: Holding, points: Any = None
+) -> list[dict[str, Any]]:
+    """The worst elements by a metric: type, number in it from 0, value, centroid, and what holds the nodes.
+
+    `points` are coordinates in place of those of the file."""
+    found = worst(metric, parts)
+    points = np.asarray(to_meshio(file, points).points, np.float64)
+    rows = []
+    for block, element, value in found:
+        kind, nodes = file.mesh.blocks[block][0], np.asarray(file.mesh.connectivity[block][element])
+        place = points[nodes[: kind.corners]].mean(axis=0).tolist()
+        number = value if math.isfinite(value) else None
+        row = {"type": kind.name, "element": element, "metric": metric.name, "value": number}
+        rows.append({**row, "place": place, "nodes": held.of(nodes)})
+    return rows
+
+
+def print_worst(out: Console, metric: Metric, rows: list[dict[str, Any]]) -> None:
+    """The worst elements, with their place and what holds them."""
     out.print(f"\nworst by {metric.name} (numbered from 0 in their type)")
-    places = centroids(file)
-    for block, element, value in worst(metric, parts):
-        name = file.mesh.types[block]
-        place = ", ".join(f"{x:.6g}" for x in places[block][element])
-        out.print(f"{name:>12} {element:>9} {value:>11.4g}   at ({place})")
+    for row in rows:
+        place = ", ".join(f"{x:.6g}" for x in row["place"])
+        out.print(f"{row['type']:>12} {row['element']:>9} {_number(row['value']):>11}   at ({place})")
+        for line in wrap(f"nodes: {row['nodes']}", 64):
+            out.print(f"{'':>12} {line}", style="dim")
 
 
 def centroids(file: MeshFile, mesh: Mesh | None = None) -> list[np.ndarray]:

@@ -218,10 +218,10 @@ def print_constraints(out: Console, constraints: Motion, mesh: Mesh) -> None:
 def print_step(out: Console, row: StepRecord) -> None:
     """The progress line of a step."""
     s = row.statistics
-    solver = f"  {row.solver_iterations:4d} iterations" if row.step else " " * 17
+    solver = f" {row.solver_iterations:4d} it" if row.step else " " * 8
     out.print(
-        f"step {row.step:2d}  q_min {s.q_min:7.4f}  q_avg {s.q_avg:7.4f}  below 0.2 {s.below:6d}"
-        f"  inverted {s.inverted:5d}{solver}  {row.seconds:6.2f} s"
+        f"step {row.step:2d} q_min {s.q_min:7.4f} q_avg {s.q_avg:6.4f} q<0.2 {s.below:6d}"
+        f" inverted {s.inverted:5d}{solver} {row.seconds:5.2f} s"
     )
 
 
@@ -284,17 +284,27 @@ def _number(value: float | None) -> str:
 
 
 def print_compare(out: Console, rows: list[dict[str, Any]]) -> None:
-    """The table of ``compare``: all elements, with movable ones behind the bar."""
-    table = Table(box=None, pad_edge=False)
-    heads = ("method", "q_min", "q_avg", "q<0.2", "sj_min", "inverted", "|", "q_min", "q_avg", "q<0.2")
-    for name in (*heads, "steps", "seconds", "compile"):
-        table.add_column(name, justify="left" if name == "method" else "right", no_wrap=True)
-    for row in rows:
-        whole, part = row["all"], row["movable"]
-        cells = [_number(whole["q_min"]), _number(whole["q_avg"]), f"{whole['q_below_0.2']:,}"]
-        cells += [_number(whole["scaled_jacobian_min"]), f"{whole['inverted']:,}", "|"]
-        cells += [_number(part.get("q_min")), _number(part.get("q_avg")), f"{part.get('q_below_0.2', 0):,}"]
-        cells += [str(row["steps"]), f"{row['seconds']:.2f}", f"{row['compile_seconds']:.1f}"]
-        table.add_row(row["method"], *cells)
-    out.print(table)
-    out.print("all elements | elements with a node that may move; seconds without compilation", style="dim")
+    """The tables of ``compare``: over all elements, and over those with a node that may move."""
+    last = ("steps", "seconds", "compile")
+    for part, title, heads in (
+        ("all", "all elements", ("q_min", "q_avg", "q<0.2", "sj_min", "inverted")),
+        ("movable", "with a node that may move", ("q_min", "q_avg", "q<0.2", *last)),
+    ):
+        table = Table(box=None, pad_edge=False, title=title, title_justify="left", title_style="bold")
+        for name in ("method", *heads):
+            table.add_column(name, justify="left" if name == "method" else "right", no_wrap=True)
+        for row in rows:
+            numbers = row[part]
+            cells = {
+                "q_min": _number(numbers.get("q_min")),
+                "q_avg": _number(numbers.get("q_avg")),
+                "q<0.2": f"{numbers.get('q_below_0.2', 0):,}",
+                "sj_min": _number(numbers.get("scaled_jacobian_min")),
+                "inverted": f"{numbers.get('inverted', 0):,}",
+                "steps": str(row["steps"]),
+                "seconds": f"{row['seconds']:.2f}",
+                "compile": f"{row['compile_seconds']:.1f}",
+            }
+            table.add_row(row["method"], *(cells[name] for name in heads))
+        out.print(table)
+    out.print("seconds are without compilation", style="dim")
