@@ -14,12 +14,14 @@ from jaxtyping import Array, Float
 
 from jaxsmooth.convert.meshfile import MeshFile, with_file
 from jaxsmooth.guards.acceptance import AcceptanceRule, Status
+from jaxsmooth.mesh.padding import Padded
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.methods import Elastic, Method
 from jaxsmooth.metrics.evaluation import Evaluation
-from jaxsmooth.metrics.summary import Statistics, evaluated, remember, statistics
+from jaxsmooth.metrics.summary import Statistics, evaluate_padded, remember, summary, without_ghosts
 from jaxsmooth.motion.base import Motion
 from jaxsmooth.motion.detect import detect_constraints
+from jaxsmooth.runs.ghosts import with_ghosts
 
 __all__ = ["SmoothResult", "StepRecord", "smooth"]
 
@@ -119,22 +121,27 @@ def smooth(
             "run(mesh, method, constraints=constraints, steps=3), with constraints found beforehand"
         )
     method = (Elastic() if method is None else method).loosely()
-    state = method.init(mesh)
     constraints = detect_constraints(mesh) if constraints is None else constraints
     _check(mesh, constraints, steps)
     accept = method.acceptance if accept is None else accept
     labels, mesh = mesh.labels, mesh.bare
+    whole, motion = with_ghosts(mesh, method, constraints)
+    state = method.init(whole.mesh)
 
     start = time.perf_counter()
-    evaluation = evaluated(mesh)
-    first = StepRecord(0, statistics(mesh, evaluation), seconds=time.perf_counter() - start)
+    evaluation = evaluate_padded(whole)
+    first = StepRecord(0, summary(whole, evaluation), seconds=time.perf_counter() - start)
+    remember(mesh, without_ghosts(whole, evaluation))
     tolerances = (tolerance_avg, tolerance_min)
-    place = _Place(mesh, evaluation, first)
-    driver = _Driver(method, constraints, state, accept, tolerances, callback, place)
+    place = _Place(whole, evaluation, first)
+    driver = _Driver(method, motion, state, accept, tolerances, callback, place)
     status = driver.run(steps)
     end, history = driver.reached, tuple(driver.history)
-    remember(end.mesh, end.evaluation)
-    return SmoothResult(end.mesh.with_labels(labels), end.evaluation, history, status, constraints, file)
+    if end.row.step:
+        mesh = mesh.with_points(whole.real_points(end.mesh.points))
+    evaluation = without_ghosts(whole, end.evaluation)
+    remember(mesh, evaluation)
+    return SmoothResult(mesh.with_labels(labels), evaluation, history, status, constraints, file)
 
 
 _PATIENCE = 3  # steps without change after which a mesh is taken to stay tangled
@@ -143,11 +150,15 @@ _EXCURSION = 2  # steps that may break the rule, and untangle nothing, before on
 
 @dataclass(frozen=True)
 class _Place:
-    """A mesh on the way, its evaluation, and its row of the history."""
+    """A mesh on the way with its ghosts, its evaluation, and its row of the history."""
 
-    mesh: Mesh
+    whole: Padded
     evaluation: Evaluation
     row: StepRecord
+
+    @property
+    def mesh(self) -> Mesh:
+        return self.whole.mesh
 
     @property
     def now(self) -> Statistics:
@@ -220,11 +231,11 @@ class _Driver:
         step = _step(self.attempts[0], before.mesh, self.motion, before.evaluation, self.state)
         if not bool(jnp.isfinite(step.points).all()):
             return Status.NOT_FINITE if bool(jnp.isfinite(step.residual)) else Status.UNSOLVED
-        mesh = before.mesh.with_points(step.points)
-        now = statistics(mesh, step.evaluation)
+        whole = before.whole._replace(mesh=before.mesh.with_points(step.points))
+        now = summary(whole, step.evaluation)
         counts = int(step.iterations), float(step.residual), int(step.shortened)
         row = StepRecord(index, now, *counts, time.perf_counter() - start)
-        return _Place(mesh, step.evaluation, row)
+        return _Place(whole, step.evaluation, row)
 
     def _accept(self) -> None:
         """The last place counts, and with it those that led there."""
