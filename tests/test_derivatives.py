@@ -121,3 +121,21 @@ def test_batches_of_every_method(square, method):
         alone = js.run(one, method, constraints=js.detect_constraints(one), steps=2)
         np.testing.assert_allclose(points, alone.points, atol=1e-14)
         np.testing.assert_allclose(mean, js.quality_mean(alone), rtol=1e-12)
+
+
+def test_one_compile_for_all_calls_outside_of_jit(square):
+    mesh, constraints, _ = square
+    run = jax.jit(lambda m: js.run(m, js.Laplacian(weighted=True), constraints=constraints, steps=1).points)
+    expected = run(mesh)
+    compiled = []
+    jax.monitoring.register_event_duration_secs_listener(lambda name, *_, **__: compiled.append(name))
+    for call in range(20):
+        moved = mesh.with_points(mesh.points + 0.001 * call)
+        for constraint in (constraints, js.Constraints(constraints.projectors + 0.0)):
+            done = js.run(moved, js.Laplacian(weighted=True), constraints=constraint, steps=1)
+            stepped = js.step(moved, js.Laplacian(weighted=True), constraint)
+        np.testing.assert_allclose(done.points, expected + 0.001 * call, atol=1e-14)
+        np.testing.assert_allclose(stepped.points, done.points, atol=1e-15)
+        if call == 0:
+            compiled.clear()
+    assert not [name for name in compiled if "backend_compile" in name]

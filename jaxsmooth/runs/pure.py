@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -39,7 +40,12 @@ def step(mesh: Any, method: Method, constraints: Motion, state: Any = None) -> M
     """
     mesh = as_mesh(mesh)
     state = method_state(method, mesh) if state is None else state
-    return mesh.with_points(method.step(mesh, constraints, _before(mesh), state).points)
+    return mesh.with_points(_step(mesh.bare, method, constraints, state))
+
+
+@jax.jit
+def _step(mesh: Mesh, method: Method, constraints: Motion, state: Any) -> Field:
+    return method.step(mesh, constraints, _before(mesh), state).points
 
 
 def _before(mesh: Mesh) -> Evaluation:
@@ -105,6 +111,13 @@ def run(
     mesh = as_mesh(mesh)
     method = Elastic() if method is None else method
     state = method_state(method, mesh) if state is None else state
+    done = _run(mesh.bare, method, constraints, state, steps)
+    return eqx.tree_at(lambda run: run.mesh, done, mesh.with_points(done.points))
+
+
+@partial(jax.jit, static_argnames="steps")
+def _run(mesh: Mesh, method: Method, constraints: Motion, state: Any, steps: int) -> Run:
+    """`run`, compiled once for all calls that differ in numbers only, also those outside of `jax.jit`."""
     saved = jax.checkpoint_policies.save_only_these_names("displacement", "accepted")
     dtype = mesh.points.dtype
     nothing = jnp.zeros((), dtype), jnp.int32(0), jnp.int32(0)
