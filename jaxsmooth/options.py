@@ -71,7 +71,7 @@ def check(options: argparse.Namespace) -> None:
 def _known(root: argparse.ArgumentParser, name: str) -> list[str]:
     """The options of a command."""
     choices = next(action.choices for action in root._actions if action.choices)
-    command = choices["quality" if name == "measure" else name]  # pyright: ignore[reportIndexIssue, reportCallIssue, reportArgumentType]
+    command = choices["quality" if name == "measure" else name]  # pyright: ignore[reportIndexIssue]
     return list(command._option_string_actions)
 
 

@@ -64,7 +64,7 @@ class _Iterate(NamedTuple):
     r: Field
     directions: Float[Array, "kept nodes dim"]
     images: Float[Array, "kept nodes dim"]
-    count: Int[Array, ""]
+    done: Int[Array, ""]
 
 
 def conjugate_residuals(
@@ -81,7 +81,7 @@ def conjugate_residuals(
 
     def unfinished(s: _Iterate):
         length = jnp.linalg.norm(s.r)
-        return (length > goal) & (s.count < max_iterations)
+        return (length > goal) & (s.done < max_iterations)
 
     def iterate(s: _Iterate) -> _Iterate:
         p, q = s.r, matvec(s.r)
@@ -92,16 +92,16 @@ def conjugate_residuals(
         length = jnp.linalg.norm(q)
         length = jnp.where(length > 0, length, 1)
         p, q = p / length, q / length
-        step, slot = jnp.vdot(q, s.r), s.count % _KEPT
+        step, slot = jnp.vdot(q, s.r), s.done % _KEPT
         directions, images = s.directions.at[slot].set(p), s.images.at[slot].set(q)
-        return _Iterate(s.x + step * p, s.r - step * q, directions, images, s.count + 1)
+        return _Iterate(s.x + step * p, s.r - step * q, directions, images, s.done + 1)
 
     none = jnp.zeros((_KEPT, *b.shape), b.dtype)
 
     def again(_, state):
         x, r, count = state
         end = jax.lax.while_loop(unfinished, iterate, _Iterate(x, r, none, none, count))
-        return end.x, b - matvec(end.x), end.count
+        return end.x, b - matvec(end.x), end.done
 
     x, r, _ = jax.lax.fori_loop(0, 3, again, (jnp.zeros_like(b), b, jnp.int32(0)))
     length = jnp.linalg.norm(b)

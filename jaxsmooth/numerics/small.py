@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,8 @@ __all__ = [
     "signed_power",
     "solve_regular",
 ]
+
+Tree = TypeVar("Tree")
 
 
 def contract(points: Float[Array, "k dim"], gradients: Float[Array, "q k j"]) -> Float[Array, "q dim j"]:
@@ -107,7 +109,7 @@ def solve_regular(a: Float[Array, "dim dim"], b: Float[Array, " dim"], floor: fl
     return jnp.where(regular, cofactors(a).T @ b / jnp.where(regular, det, 1), 0)
 
 
-def in_precision(tree: Any, dtype: Any) -> Any:
+def in_precision(tree: Tree, dtype: Any) -> Tree:
     """A pytree with all arrays of floats in the type of the mesh that they are used with."""
 
     def cast(leaf):

@@ -79,7 +79,8 @@ def optimum(
         The optimum, and whether it was found.
     """
     mesh = as_mesh(mesh)
-    energy, motion = in_precision((Energy() if energy is None else energy, motion), mesh.points.dtype)
+    chosen = Energy() if energy is None else energy
+    energy, motion = in_precision((chosen, motion), mesh.points.dtype)
     tolerance = gradient_tolerance(mesh.points.dtype) if tolerance is None else tolerance
     frame = Frame.of(mesh.points)
     points, within = frame.into(mesh.points), motion.within(frame)
@@ -91,7 +92,7 @@ def optimum(
     # the frame is a power of two and an origin: what does not move keeps its bits
     move = (_place(u, points, within) - points) / frame.scale
     done = mesh.with_points(motion.retract(mesh.points, move))
-    return Optimum(done, energy(done, motion), end.size, end.count, end.size <= tolerance)
+    return Optimum(done, energy(done, motion), end.size, end.steps, end.size <= tolerance)
 
 
 def _place(u: Field, points: Field, motion: Motion) -> Field:
@@ -105,7 +106,7 @@ class _State(NamedTuple):
     value: Scalar
     gradient: Field
     size: Scalar
-    count: Int[Array, ""]
+    steps: Int[Array, ""]
     stuck: Bool[Array, ""]
 
 
@@ -163,7 +164,7 @@ class _Search(NamedTuple):
             return _State(u, energy_there, gradient, size, count, stuck)
 
         def unfinished(state):
-            return (state.size > self.tolerance) & (state.count < max_steps) & ~state.stuck
+            return (state.size > self.tolerance) & (state.steps < max_steps) & ~state.stuck
 
         def again(state):
             move = self._direction(state, fixed)
@@ -185,7 +186,7 @@ class _Search(NamedTuple):
                 jnp.where(stuck, state.u, state.u + length * move),
                 jnp.where(stuck, state.value, after),
             )
-            return measured(u, after, state.count + 1, stuck)
+            return measured(u, after, state.steps + 1, stuck)
 
         begun = Newton(iterations=30, tolerance=1e-6)(task, points).points
         u = motion.at(points).independent(begun - points)

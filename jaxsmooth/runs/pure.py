@@ -215,8 +215,8 @@ def fixed_point(
         The mesh, the number of steps, the last change, and whether it is within the tolerance.
     """
     mesh = as_mesh(mesh)
-    method = Elastic() if method is None else method
-    method, constraints = in_precision((method, constraints), mesh.points.dtype)
+    chosen = Elastic() if method is None else method
+    method, constraints = in_precision((chosen, constraints), mesh.points.dtype)
     tolerance = max(1e-9, gradient_tolerance(mesh.points.dtype)) if tolerance is None else tolerance
     state = method_state(method, mesh)
     bare = eqx.tree_at(lambda m: m.guard, method, None, is_leaf=lambda x: x is None)
