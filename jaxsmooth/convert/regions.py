@@ -50,7 +50,6 @@ REGION_NAMES = (
     "unv:property",
     "avsucd:material",
     "flac3d:group",
-    "cell_tags",
     "material",
     "materials",
     "materialid",
@@ -75,6 +74,7 @@ REGION_NAMES = (
     "group",
     "groups",
     "groupid",
+    "cell_tags",
 )
 """Cell data taken for material tags, first match first; case, ``_``, ``-`` and blanks don't count."""
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import meshio
 import numpy as np
 
@@ -24,10 +27,12 @@ __all__ = [
     "add_materials",
     "as_tags",
     "data_to_sets",
+    "families_to_sets",
     "keep_boundary_tags",
     "material_name",
     "sets_as_masks",
     "sets_to_data",
+    "tags_name",
 ]
 
 GMSH_TAGS = ("gmsh:physical", "gmsh:geometrical")
@@ -50,6 +55,34 @@ def material_name(mesh: meshio.Mesh, dim: int) -> str | None:
             return name
         only = name if only is None and joined.any() else only
     return only
+
+
+def tags_name(mesh: meshio.Mesh, dim: int) -> str | None:
+    """The same; where the elements have no tags, the cell data that the cells of their boundary have."""
+    arrays = region_arrays(mesh, range(len(mesh.cells)))
+    tagged = (name for name, tags in arrays if any(part.any() for part in tags.values()))
+    return material_name(mesh, dim) or next(tagged, None)
+
+
+def families_to_sets(mesh: meshio.Mesh) -> None:
+    """The families of a MED file, which meshio keeps as tags and their names, become sets."""
+    mesh.point_sets, mesh.cell_sets = dict(mesh.point_sets), dict(mesh.cell_sets)
+    tags, parts = mesh.point_data.get("point_tags"), mesh.cell_data.get("cell_tags")
+    of_points = _by_name(getattr(mesh, "point_tags", {})) if tags is not None else {}
+    of_cells = _by_name(getattr(mesh, "cell_tags", {})) if parts is not None else {}
+    for name, own in of_points.items():
+        mesh.point_sets.setdefault(name, np.flatnonzero(np.isin(tags, own)))
+    for name, own in of_cells.items():
+        mesh.cell_sets.setdefault(name, [np.flatnonzero(np.isin(part, own)) for part in parts or ()])
+    for name in ("point_tags", "cell_tags"):
+        if hasattr(mesh, name):
+            delattr(mesh, name)
+
+
+def _by_name(families: Mapping[Any, list[str]]) -> dict[str, list[Any]]:
+    """Numbers of the families that have a name, for each name."""
+    names = dict.fromkeys(name for own in families.values() for name in own)
+    return {name: [number for number, own in families.items() if name in own] for name in names}
 
 
 def add_materials(mesh: meshio.Mesh, holds: Holds, dim: int, notes: list[str]) -> None:
@@ -175,8 +208,10 @@ def data_to_sets(mesh: meshio.Mesh, dim: int) -> list[str]:
         if folded(name) in _FOLDED and all(np.ndim(part) == 1 for part in parts):
             parts = as_tags(parts)
             tags = np.unique(np.concatenate(parts))
-            if (covered and name in GMSH_TAGS) or not tags.any():
+            if (covered and name == GMSH_TAGS[1]) or not tags.any():
                 continue
+            if name == GMSH_TAGS[0]:
+                tags = [tag for tag in tags if not _has_names(mesh, parts, tag)]
             for tag in tags:
                 members = [np.flatnonzero(part == tag) for part in parts]
                 mesh.cell_sets.setdefault(f"{name.replace(':', '_').replace(' ', '_')}_{tag}", members)
@@ -186,3 +221,10 @@ def data_to_sets(mesh: meshio.Mesh, dim: int) -> list[str]:
         else:
             lost.append(name)
     return lost
+
+
+def _has_names(mesh: meshio.Mesh, parts: list[np.ndarray], tag: Any) -> bool:
+    """Whether Gmsh's groups of this number have names; 0 is no group where there are any."""
+    named = {(int(entry[0]), int(entry[1])) for entry in mesh.field_data.values() if np.shape(entry) == (2,)}
+    dims = {cells.dim for cells, part in zip(mesh.cells, parts, strict=True) if (part == tag).any()}
+    return bool(named) and (tag == 0 or all((int(tag), dim) in named for dim in dims))

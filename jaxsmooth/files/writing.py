@@ -16,7 +16,7 @@ from jaxsmooth.convert.regions import NOT_SETS, SECTIONS, plain, recall
 from jaxsmooth.files.formats.meshios import quiet
 from jaxsmooth.files.formats.record import Format, stem_format
 from jaxsmooth.files.formats.table import FORMATS, format_named
-from jaxsmooth.files.reduction import BLOCKWISE, UNKEPT, add_materials, sets_to_data
+from jaxsmooth.files.reduction import BLOCKWISE, UNKEPT, add_materials, families_to_sets, sets_to_data
 
 __all__ = ["check_types", "check_writable", "write_source"]
 
@@ -73,8 +73,8 @@ def write_source(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> list[s
         add_materials(mesh, record.holds, dim, notes)
     sets_to_data(mesh, record, notes)
     if not record.holds.any_data:
-        lost = [name for name in record.holds.reduce(mesh, dim) if name != "gmsh:dim_tags"]
-        if lost:
+        names = dict.fromkeys(record.holds.reduce(mesh, dim))
+        if lost := [name for name in names if name != "gmsh:dim_tags"]:
             notes.append(
                 f"{record.name} files can't hold these data, which are not written: {', '.join(lost)}"
             )
@@ -90,10 +90,10 @@ def write_source(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> list[s
         ) from error
     except (Exception, SystemExit) as error:  # meshio's writers raise anything
         kind = f"it has no place for {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
+        kind = kind or "the writer does not take it"
         others = " or ".join(suffix for suffix in (".vtu", ".msh", ".xdmf", ".npz") if suffix != path.suffix)
         raise MeshFileError(
-            f"{path}: this mesh can't be written as {record.name}: {kind or type(error).__name__}; "
-            f"write {others} instead"
+            f"{path}: this mesh can't be written as {record.name}: {kind}; write {others} instead"
         ) from error
     if "kipping" in said.getvalue() and "cells" in said.getvalue():
         raise MeshFileError(
@@ -105,6 +105,7 @@ def write_source(path: Path, mesh: meshio.Mesh, format: str, dim: int) -> list[s
 def _clean(mesh: meshio.Mesh, record: Format, notes: list[str]) -> meshio.Mesh:
     """A copy with native arrays that every writer takes, without cells that the format lacks."""
     out, holds = copy.copy(mesh), record.holds
+    families_to_sets(out)
     kept = [k for k, cells in enumerate(mesh.cells) if len(cells)]
     lacking = [k for k in kept if not holds.cells(mesh.cells[k].type)]
     if lacking:
@@ -135,10 +136,10 @@ def _clean(mesh: meshio.Mesh, record: Format, notes: list[str]) -> meshio.Mesh:
             out.point_data[name] = array
     out.cell_sets = {
         name: [members[k] if k < len(members) else None for k in kept]
-        for name, members in mesh.cell_sets.items()
+        for name, members in out.cell_sets.items()
         if name not in NOT_SETS or name in holds.private
     }
-    out.point_sets, out.field_data = dict(mesh.point_sets), dict(mesh.field_data)
+    out.field_data = dict(mesh.field_data)
     if isinstance(mesh.info, dict):
         by_block = {key: mesh.info[key] for key in (SECTIONS, *BLOCKWISE) if key in mesh.info}
         out.info = mesh.info | {key: [parts[k] for k in kept] for key, parts in by_block.items()}

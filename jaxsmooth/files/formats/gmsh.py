@@ -22,7 +22,7 @@ from jaxsmooth.files.formats.mshnodes import patch_msh
 from jaxsmooth.files.formats.mshraw import check_msh, read_entities
 from jaxsmooth.files.formats.mshtypes import reorder_for_writing, reorder_read
 from jaxsmooth.files.formats.record import Format, Holds
-from jaxsmooth.files.reduction import GMSH_TAGS, as_tags, material_name
+from jaxsmooth.files.reduction import GMSH_TAGS, as_tags, tags_name
 
 __all__ = ["GMSH", "GMSH22", "read_gmsh", "write_gmsh", "write_gmsh22"]
 
@@ -65,7 +65,7 @@ def write_gmsh22(path: Path, mesh: meshio.Mesh, dim: int, variant: str = "binary
 def _tag(mesh: meshio.Mesh, dim: int) -> None:
     """Both of Gmsh's tags for all cells; other material tags are physical groups to it."""
     if "gmsh:physical" not in mesh.cell_data:
-        name = material_name(mesh, dim)
+        name = tags_name(mesh, dim)
         zero = [np.zeros(len(cells), np.int32) for cells in mesh.cells]
         used = name not in (None, *GMSH_TAGS)
         mesh.cell_data["gmsh:physical"] = as_tags(mesh.cell_data[name]) if used else zero

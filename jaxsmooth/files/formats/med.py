@@ -13,12 +13,36 @@ from jaxsmooth.files.formats.hdf5 import read_array, replace_array
 from jaxsmooth.files.formats.meshios import read_as, reduce_rare, write_again
 from jaxsmooth.files.formats.record import Format, Holds, Patched, Source, UnpatchableError
 from jaxsmooth.files.numbers import check_columns, check_old
+from jaxsmooth.files.reduction import sets_as_masks
 
 __all__ = ["MED"]
 
 
 def _write(path: Path, mesh: meshio.Mesh, dim: int, variant: str) -> list[str]:
-    return write_again(path, mesh, dim, MED)
+    """Sets are families: each combination of them has a number, positive for nodes, negative for cells."""
+    of_points, of_cells = sets_as_masks(mesh)
+    mesh.point_sets, mesh.cell_sets, mesh.field_data = {}, {}, {}
+    notes = []
+    if slashed := [name for name in (*of_points, *of_cells) if "/" in name]:
+        notes.append(f"names in med files have no slash; written with underscores: {', '.join(slashed)}")
+    if of_points:
+        tags, mesh.point_tags = _families(of_points)
+        mesh.point_data["point_tags"] = tags
+    if of_cells:
+        tags, families = _families({name: np.concatenate(masks) for name, masks in of_cells.items()})
+        ends = np.cumsum([len(cells) for cells in mesh.cells])[:-1]
+        mesh.cell_data["cell_tags"] = np.split(-tags, ends)
+        mesh.cell_tags = {-number: names for number, names in families.items()}
+    return [*notes, *write_again(path, mesh, dim, MED)]
+
+
+def _families(masks: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[int, list[str]]]:
+    """A number for every combination of sets, 0 for none, and the names of each."""
+    rows, tags = np.unique(np.stack(list(masks.values()), axis=1), axis=0, return_inverse=True)
+    names = [name.replace("/", "_") for name in masks]
+    sets = [[name for name, inside in zip(names, row, strict=True) if inside] for row in rows]
+    numbers = np.cumsum([bool(own) for own in sets]) * [bool(own) for own in sets]
+    return numbers[tags.reshape(-1)], {int(n): own for n, own in zip(numbers, sets, strict=True) if own}
 
 
 def patch_med(
@@ -43,5 +67,11 @@ def patch_med(
 
 
 MED = Format(
-    "med", (".med",), read_as("med"), _write, Holds(reduce=reduce_rare), needs="h5py", patch=patch_med
+    "med",
+    (".med",),
+    read_as("med"),
+    _write,
+    Holds(sets=True, reduce=reduce_rare),
+    needs="h5py",
+    patch=patch_med,
 )

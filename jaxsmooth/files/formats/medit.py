@@ -16,7 +16,7 @@ from jaxsmooth.convert.labels import HELD
 from jaxsmooth.convert.regions import integers
 from jaxsmooth.files.formats.record import Format, Holds, Patched, Source, UnpatchableError
 from jaxsmooth.files.numbers import Places, blanked, put_binary, put_text, tokens
-from jaxsmooth.files.reduction import UNKEPT, as_tags, material_name
+from jaxsmooth.files.reduction import UNKEPT, as_tags, tags_name
 
 __all__ = ["MEDIT", "read_medit", "write_medit"]
 
@@ -157,7 +157,7 @@ def _binary_sets(content: bytes) -> dict[str, np.ndarray]:
 
 
 def _reduce(mesh: meshio.Mesh, dim: int) -> list[str]:
-    lost, name = [*mesh.point_data, *mesh.cell_data], material_name(mesh, dim)
+    lost, name = [*mesh.point_data, *mesh.cell_data], tags_name(mesh, dim)
     mesh.cell_data = {"medit:ref": as_tags(mesh.cell_data[name])} if name else {}
     values = integers(mesh.point_data["medit:ref"]) if "medit:ref" in mesh.point_data else None
     mesh.point_data = {"medit:ref": values} if values is not None else {}

@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxsmooth.convert.checks import SYNONYMS, check_last_line
 from jaxsmooth.files.formats.record import Format, Reader
-from jaxsmooth.files.reduction import as_tags, material_name
+from jaxsmooth.files.reduction import as_tags, material_name, tags_name
 
 __all__ = ["quiet", "read_as", "read_copy", "reduce_rare", "remarks", "write_again"]
 
@@ -70,9 +70,11 @@ def write_again(path: Path, mesh: meshio.Mesh, dim: int, format: Format) -> list
     """Formats whose writers leave out cells or data without a word: what they wrote is read again.
 
     Returns notes on what is missing then; raises `ValueError` where cells are."""
-    said = dict.fromkeys((*mesh.point_data, *mesh.cell_data))
-    if format.name in ("med", "hmf", "h5m"):
+    of_points, of_cells = list(mesh.point_data), list(mesh.cell_data)
+    if format.name in ("med", "hmf", "h5m", "tetgen", "cgns"):
         _merge_blocks(mesh)
+    if format.name == "avsucd" and len(mesh.cells) > 1:  # the reader fails with more than materials
+        mesh.cell_data = dict(list(mesh.cell_data.items())[:1])
     if format.name == "h5m":  # fails with any
         mesh.cell_data = {}
     material = material_name(mesh, dim)
@@ -82,10 +84,11 @@ def write_again(path: Path, mesh: meshio.Mesh, dim: int, format: Format) -> list
     again = format.read(path)[0]
     if len(again.points) != len(mesh.points) or _sizes(again) != _sizes(mesh):
         raise ValueError(f"it would have {_sizes(again)} instead of {_sizes(mesh)}")
-    kept = {*again.point_data, *again.cell_data, "gmsh:dim_tags"}
+    kept = {*again.cell_data, "gmsh:dim_tags"}
     if material is not None and material_name(again, dim):
         kept.add(material)
-    lost = [name for name in said if name not in kept]
+    lost = [name for name in of_points if name not in {*again.point_data, "gmsh:dim_tags"}]
+    lost += [name for name in of_cells if name not in kept and name not in lost]
     if not lost:
         return []
     return [f"{format.name} files can't hold these data, which are not written: {', '.join(lost)}"]
@@ -116,7 +119,7 @@ def reduce_rare(mesh: meshio.Mesh, dim: int, own: str | None = None) -> list[str
     """Put the material tags first: meshio's writers take the first whole numbers, or those of `own` name.
 
     What they leave out differs from format to format, so nothing is said to be lost here."""
-    if name := material_name(mesh, dim):
+    if name := tags_name(mesh, dim):
         tags = as_tags(mesh.cell_data.pop(name))
         mesh.cell_data = {own or name: tags, **mesh.cell_data}
     return []

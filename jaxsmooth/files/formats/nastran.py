@@ -57,7 +57,14 @@ _READ = read_as("nastran", text=True, end="ENDDATA")
 
 
 def _write(path: Path, mesh: meshio.Mesh, dim: int, variant: str) -> list[str]:
-    return write_again(path, mesh, dim, NASTRAN)
+    """Meshio writes negative numbers of many digits into no field, so coordinates are put in afterwards."""
+    points = np.zeros((len(mesh.points), 3))
+    points[:, : mesh.points.shape[1]] = mesh.points
+    mesh.points = np.zeros_like(points)
+    notes = write_again(path, mesh, dim, NASTRAN)
+    patched = patch_nastran(Source(path.read_bytes(), path, path), mesh.points, points)
+    path.write_bytes(patched.content)
+    return [*notes, *patched.notes]
 
 
 # --- Other coordinates ---------------------------------------------------------------------

@@ -45,6 +45,7 @@ def _surfaces(name: str, *suffixes: str) -> Format:
 
 
 _LINEAR = frozenset({"line", "triangle", "quad", "tetra", "wedge", "pyramid", "hexahedron"})
+_SOLID = frozenset({"tetra", "wedge", "pyramid", "hexahedron"})
 _AVS = rb"\A\s*(\d+)(?:[ \t]+\d+){4}[ \t]*\r?\n"
 _NETGEN = rb"^points\s+(\d+)"
 _ROOMLESS = "dolfin-xml files have no room for data, tags and sets; write .xdmf instead"
@@ -52,16 +53,16 @@ _ROOMLESS = "dolfin-xml files have no room for data, tags and sets; write .xdmf 
 RARE = (
     _format("ansys", ".msh"),
     _format("avsucd", ".avs", ".inp", types=_LINEAR | {"vertex"}, text=True, patch=patch_table(_AVS, 1)),
-    _format("cgns", ".cgns", needs="h5py"),
+    _format("cgns", ".cgns", types=frozenset({"tetra"}), needs="h5py"),
     _format("dolfin-xml", ".xml", refusal=_ROOMLESS),
-    _format("flac3d", ".f3grid", text=True),
+    _format("flac3d", ".f3grid", types=_SOLID, text=True),
     _format("h5m", ".h5m", needs="h5py"),
     _format("hmf", ".hmf", needs="h5py"),
     _format("mdpa", ".mdpa", text=True),
     _format("netgen", ".vol", ".vol.gz", text=True, end="endmesh", patch=patch_table(_NETGEN, 0)),
     _format("permas", ".post", ".post.gz", ".dato", ".dato.gz", text=True),
     _format("tecplot", ".dat", ".tec", text=True),
-    _format("tetgen", ".ele", ".node"),
+    _format("tetgen", ".ele", ".node", types=frozenset({"tetra"})),
     _surfaces("neuroglancer"),
     _surfaces("obj", ".obj"),
     _surfaces("off", ".off"),

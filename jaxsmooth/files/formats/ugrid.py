@@ -11,7 +11,7 @@ from jaxsmooth.convert.checks import check_last_line
 from jaxsmooth.files.formats.meshios import read_as
 from jaxsmooth.files.formats.record import Format, Holds
 from jaxsmooth.files.formats.tables import patch_table
-from jaxsmooth.files.reduction import keep_boundary_tags
+from jaxsmooth.files.reduction import keep_boundary_tags, material_name
 
 __all__ = ["UGRID", "is_text", "read_ugrid", "write_ugrid"]
 
@@ -88,6 +88,12 @@ def write_ugrid(path: Path, mesh: meshio.Mesh, dim: int, variant: str = "") -> l
     return []
 
 
+def _reduce(mesh: meshio.Mesh, dim: int) -> list[str]:
+    material = material_name(mesh, dim)
+    lost, name = keep_boundary_tags(mesh, dim, "ugrid:ref", 2)
+    return [*lost, f"{name} of the elements"] if dim == 3 and name and name == material else lost
+
+
 def _refuse(path: Path) -> str | None:
     if is_text(path):
         return None
@@ -101,7 +107,7 @@ UGRID = Format(
     write_ugrid,
     Holds(
         types=frozenset({*_SURFACE, *_VOLUME}),
-        reduce=lambda mesh, dim: keep_boundary_tags(mesh, dim, "ugrid:ref", 2)[0],
+        reduce=_reduce,
     ),
     refuse=_refuse,
     patch=patch_table(rb"\A\s*(\d+)(?:\s+\d+){6}\s", 0),

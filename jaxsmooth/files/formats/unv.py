@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from jaxsmooth.files.formats.record import Format, Holds, Patched, Source, UnpatchableError
 from jaxsmooth.files.numbers import Places, put_text, tokens
-from jaxsmooth.files.reduction import UNKEPT, data_to_sets, material_name
+from jaxsmooth.files.reduction import UNKEPT, data_to_sets, tags_name
 
 __all__ = ["UNV", "patch_unv", "read_unv", "write_unv"]
 
@@ -221,7 +221,7 @@ def _eights(numbers: list[int]) -> str:
 
 
 def _reduce(mesh: meshio.Mesh, dim: int) -> list[str]:
-    name = material_name(mesh, dim)
+    name = tags_name(mesh, dim)
     tags = mesh.cell_data.pop(name) if name else None
     lost = data_to_sets(mesh, dim)
     mesh.point_data = {}
