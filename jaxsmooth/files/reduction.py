@@ -68,10 +68,10 @@ def families_to_sets(mesh: meshio.Mesh) -> None:
     """The families of a MED file, which meshio keeps as tags and their names, become sets."""
     mesh.point_sets, mesh.cell_sets = dict(mesh.point_sets), dict(mesh.cell_sets)
     tags, parts = mesh.point_data.get("point_tags"), mesh.cell_data.get("cell_tags")
-    of_points = _by_name(getattr(mesh, "point_tags", {})) if tags is not None else {}
+    of_points = {} if tags is None else _by_name(getattr(mesh, "point_tags", {}))
     of_cells = _by_name(getattr(mesh, "cell_tags", {})) if parts is not None else {}
     for name, own in of_points.items():
-        mesh.point_sets.setdefault(name, np.flatnonzero(np.isin(tags, own)))
+        mesh.point_sets.setdefault(name, np.flatnonzero(np.isin(np.asarray(tags), own)))
     for name, own in of_cells.items():
         mesh.cell_sets.setdefault(name, [np.flatnonzero(np.isin(part, own)) for part in parts or ()])
     for name in ("point_tags", "cell_tags"):

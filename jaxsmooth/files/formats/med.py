@@ -26,13 +26,14 @@ def _write(path: Path, mesh: meshio.Mesh, dim: int, variant: str) -> list[str]:
     if slashed := [name for name in (*of_points, *of_cells) if "/" in name]:
         notes.append(f"names in med files have no slash; written with underscores: {', '.join(slashed)}")
     if of_points:
-        tags, mesh.point_tags = _families(of_points)
+        tags, names = _families(of_points)
+        setattr(mesh, "point_tags", names)  # noqa: B010  meshio's own, which its class does not declare
         mesh.point_data["point_tags"] = tags
     if of_cells:
         tags, families = _families({name: np.concatenate(masks) for name, masks in of_cells.items()})
         ends = np.cumsum([len(cells) for cells in mesh.cells])[:-1]
         mesh.cell_data["cell_tags"] = np.split(-tags, ends)
-        mesh.cell_tags = {-number: names for number, names in families.items()}
+        setattr(mesh, "cell_tags", {-number: names for number, names in families.items()})  # noqa: B010
     return [*notes, *write_again(path, mesh, dim, MED)]
 
 
