@@ -11,7 +11,7 @@ from pathlib import Path
 __all__ = ["cache_folder", "keep_compiled"]
 
 _LARGEST = 512 * 2**20  # bytes; the programs that were not used for longest go first
-_SECONDS = 0.2  # what is compiled faster is not worth a file
+_SECONDS = 0.2  # what is compiled faster is not worth a file, unless JAX's own variable says otherwise
 _OFF = ("off", "0", "")
 
 
@@ -65,6 +65,7 @@ def keep_compiled(folder: str | os.PathLike | None = None) -> Path | None:
     if not os.access(path, os.W_OK):
         return None
     jax.config.update("jax_compilation_cache_dir", str(path))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", _SECONDS)
+    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", _SECONDS)
     jax.config.update("jax_compilation_cache_max_size", _LARGEST)
     return path

@@ -12,6 +12,7 @@ gmsh = pytest.importorskip("gmsh")
 @pytest.fixture
 def model():
     gmsh.initialize(interruptible=False)
+    gmsh.clear()  # forgets errors of earlier models, after which meshes keep their order
     gmsh.option.setNumber("General.Terminal", 0)
     gmsh.model.add("test")
     yield gmsh.model

@@ -19,6 +19,7 @@ CODES |= {"hexahedron20": 17, "wedge15": 18, "pyramid13": 19}
 @pytest.fixture
 def sdk():
     gmsh.initialize(interruptible=False)
+    gmsh.clear()  # forgets errors of earlier models, after which meshes keep their order
     gmsh.option.setNumber("General.Terminal", 0)
     yield gmsh.model.mesh
     gmsh.finalize()

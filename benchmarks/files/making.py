@@ -56,6 +56,7 @@ def _by_gmsh(*, model: dict | None = None, **options: float) -> Callable[[Path],
         import gmsh
 
         gmsh.initialize(interruptible=False)
+        gmsh.clear()  # forgets errors of earlier models, after which meshes keep their order
         try:
             gmsh.option.setNumber("General.Terminal", 0)
             _gmsh_model(**(model or {}))
