@@ -14,7 +14,7 @@ import numpy as np
 
 def _run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "JAXSMOOTH_CACHE": str(folder / "cache"), "COLUMNS": "80"}
-    environment["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"  # how long a program takes must not matter
+    environment["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"  # quick or not, all are kept
     environment.pop("TF_CPP_MIN_LOG_LEVEL", None)
     command = [sys.executable, "-m", "jaxsmooth", *words]
     return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=Path.cwd())
