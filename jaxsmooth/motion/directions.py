@@ -167,7 +167,8 @@ class Vectors(NamedTuple):
 def _known(vectors: np.ndarray, size: np.ndarray, height, noise: Noise, flatness: float | None) -> Vectors:
     """Vectors ``[m, s, dim]`` of their sizes ``[m, s]`` made unit ones."""
     known = (height > noise.type) & (size > 0).all(axis=1)
-    tolerance = np.clip(noise.all / np.maximum(height, np.finfo(float).tiny), _FLAT, _ROUGH)
+    least = np.maximum(noise.all / _ROUGH, np.finfo(float).tiny)  # below it the angle is as large as it gets
+    tolerance = np.clip(noise.all / np.maximum(height, least), _FLAT, _ROUGH)
     if flatness is not None:
         tolerance = np.full(len(height), float(flatness))
     return Vectors(vectors / np.where(size > 0, size, 1)[..., None], height, tolerance, known)
