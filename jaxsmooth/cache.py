@@ -43,7 +43,8 @@ def _processor() -> str:
 def keep_compiled(folder: str | os.PathLike | None = None) -> Path | None:
     """Keep what JAX compiles from now on, and use what was kept.
 
-    The command line does so by default.  Several processes may share a folder.  Where XLA complains about
+    The command line does so by default.  Several processes may share a folder.  Programs that compile faster
+    than 0.2 s, or ``JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS``, are not kept.  Where XLA complains about
     features of the processor as it loads a program, nothing is wrong; ``TF_CPP_MIN_LOG_LEVEL=3`` in the
     environment, set before JAX is imported, silences it.
 

@@ -36,6 +36,8 @@ POOR = Statistics(0.1, 1.0, 0.8, 0.1, below=7, inverted=2, scaled_jacobian_min=-
         (POOR, {"inverted": 1}, None),
         (POOR, {"inverted": 0, "q_avg": 0.7}, None),
         (POOR, {"inverted": 1, "q_avg": 0.7}, Status.LOWER_AVERAGE),
+        # flat elements before and after, whose sign is but rounding
+        (replace(POOR, q_min=-1e-16), {"inverted": 0, "q_min": 1e-16, "q_avg": 0.7}, Status.LOWER_AVERAGE),
         (replace(GOOD, below=9), {"below": 8, "scaled_jacobian_min": 0.3}, None),
         (replace(GOOD, below=9), {"below": 8, "scaled_jacobian_min": 0.29}, Status.LOWER_CORNER),
         (POOR, {"below": 6, "q_avg": 0.7}, Status.LOWER_AVERAGE),

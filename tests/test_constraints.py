@@ -42,6 +42,18 @@ def test_counts_of_a_cube():
     np.testing.assert_array_equal(np.bincount(found), [8, 12, 6, 1])
 
 
+def test_a_facet_without_height_holds_its_nodes_at_any_size():
+    """In the largest mesh its angle to the others is past what numbers can tell."""
+    points, blocks = meshes.grid("tetra")
+    side = points[:, 0] == 0
+    middle = np.flatnonzero(side & (points[:, 1:] == 0.5).all(axis=1))[0]
+    points[middle] = 0  # onto a corner of the cube
+    for size in (1.0, 1e17):
+        free = detect_constraints(Mesh(size * points, blocks)).freedom
+        assert free[middle] == 0
+        assert free.max() == 3
+
+
 def test_polygon_with_a_reentrant_corner():
     points, blocks = meshes.grid("quad", (4, 4))
     centre = points[blocks["quad"]].mean(axis=1)

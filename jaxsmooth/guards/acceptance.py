@@ -37,8 +37,8 @@ class AcceptanceRule:
 
     The guard of a method looks at patches and elements; this looks at the whole mesh.  Against the
     input there may be no more inverted elements, no more poor ones, no lower q_avg (unless a tangled mesh
-    has become valid); q_min may not fall below 0.2, nor the least scaled Jacobian below 0.1, unless they
-    were there already.  Against the last
+    has become valid by more than rounding); q_min may not fall below 0.2, nor the least scaled Jacobian
+    below 0.1, unless they were there already.  Against the last
     step that counted neither of the two may fall at all, the scaled Jacobian where it is below 0.7, unless
     inverted or poor elements have become fewer (for fewer poor ones it may fall to 0.3), and something has
     to be better.
@@ -76,7 +76,7 @@ class AcceptanceRule:
             now: statistics of the step.
             rounding: differences of qualities that mean nothing.
         """
-        untangled = first.inverted > now.inverted == 0
+        untangled = first.inverted > now.inverted == 0 and now.q_min > rounding
         fewer = (now.inverted, now.below) < (last.inverted, last.below)
         q, corner = min(first.q_min, POOR), min(first.scaled_jacobian_min, _CLOSED)
         if not fewer:
