@@ -23,9 +23,10 @@ __all__ = [
     "Chunks",
     "cut",
     "each",
+    "elements_with",
     "gather",
     "mapped",
-    "patch_any",
+    "over_chosen",
     "patch_max",
     "patch_mean",
     "patch_min",
@@ -158,6 +159,35 @@ def each(function: Callable[..., Any], chunks: Chunks, fields: Any) -> Any:
     return jax.tree.map(chunks.flat, scan(visit, None, chunks, fields)[1])
 
 
+def over_chosen(
+    function: Callable[[Any, Int[Array, " size"]], Any],
+    start: Any,
+    chosen: Bool[Array, " elements"],
+    execution: Execution,
+    weight: int = 1,
+) -> Any:
+    """Carry `start` through the chosen elements of a block: ``function(carry, numbers) -> carry``.
+
+    It costs as much as the chosen ones, whose numbers come in ascending order; the last numbers may be
+    those of ghosts: the number of elements.  Not differentiable in reverse.
+    """
+    count = len(chosen)
+    if not count:
+        return start
+    size = execution.portion(count, weight)
+    place = jax.lax.associative_scan(jnp.add, chosen.astype(jnp.int32))
+    order = jnp.full(count + size, count, jnp.int32)
+    target = jnp.where(chosen, place - 1, len(order))
+    order = order.at[target].set(jnp.arange(count, dtype=jnp.int32), mode="drop")
+
+    def visit(state):
+        first, carry = state
+        return first + size, function(carry, jax.lax.dynamic_slice(order, (first,), (size,)))
+
+    state = varying_like((jnp.int32(0), start), chosen)
+    return jax.lax.while_loop(lambda state: state[0] < place[-1], visit, state)[1]
+
+
 def sum_to_nodes(function: Callable[..., Array], chunks: Chunks, fields: Any, total: Array) -> Array:
     """`total` ``[nodes, …]`` plus the contributions ``[k, …] = function(data, local fields)``."""
 
@@ -185,12 +215,9 @@ def patch_min(mesh: Mesh, values: Sequence[Array | None]) -> Float[Array, " node
     return least
 
 
-def patch_any(mesh: Mesh, masks: Sequence[Array]) -> Bool[Array, " nodes"]:
-    """Nodes of patches with a true value in masks as `patch_min` takes values."""
-    found = jnp.zeros(len(mesh.points), bool)
-    for nodes, part in zip(mesh.connectivity, masks, strict=True):
-        found = found.at[nodes].max(_wide(part), mode="promise_in_bounds")
-    return found
+def elements_with(mesh: Mesh, marked: Bool[Array, " nodes"]) -> tuple[Bool[Array, " _"], ...]:
+    """Elements that have a marked node, block by block."""
+    return tuple(gather(marked, nodes).any(axis=1) for nodes in mesh.connectivity)
 
 
 def patch_max(mesh: Mesh, values: Sequence[Array]) -> Float[Array, " nodes"]:

@@ -3,6 +3,7 @@
 import meshes
 import numpy as np
 import pytest
+from damage import Damage, damaged
 
 from jaxsmooth.mesh.record import Labels, Mesh
 from jaxsmooth.motion.detect import detect_constraints
@@ -52,6 +53,14 @@ def test_a_facet_without_height_holds_its_nodes_at_any_size():
         free = detect_constraints(Mesh(size * points, blocks)).freedom
         assert free[middle] == 0
         assert free.max() == 3
+
+
+def test_nodes_among_tiny_facets_slide_in_the_plane_of_the_large_ones():
+    """A graded and turned side, 1000 times as long as wide: tiny facets have normals off by 1e-8."""
+    case = damaged("tetra10", Damage(jiggle=0.8, grading=4.0, stretch=1e3, turned=True, seed=124))
+    free = np.asarray(detect_constraints(case.mesh).projectors)
+    for nodes, normal, _ in case.planes:
+        assert np.abs(free[nodes] @ normal).max() < 1e-12
 
 
 def test_polygon_with_a_reentrant_corner():

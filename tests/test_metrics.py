@@ -201,6 +201,14 @@ def test_scaled_jacobian_by_hand(kind, nodes, expected):
     assert evaluate(kind, np.array(nodes, float))["scaled_jacobian"][0] == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.parametrize("shift", [0.0, 100.0])
+def test_scaled_jacobian_where_a_tangent_vanishes(shift):
+    """With the mid-side nodes of a corner at the quarter of their edges: the tangents there are 0."""
+    nodes = np.array([(0, 0), (1, 0), (0, 1), (0.25, 0), (0.5, 0.5), (0, 0.25)])
+    turned = nodes @ meshes.rotation_matrix(2, 3).T + shift
+    assert evaluate("triangle6", turned)["scaled_jacobian"][0] == 0
+
+
 def test_mean_ratio_and_edge_ratio_by_hand():
     # one affine map from the ideal element: dim det^(2/dim) / |A|² at every corner
     for kind, dim in (

@@ -6,8 +6,9 @@ import meshes
 import numpy as np
 import pytest
 
-from jaxsmooth.assembly import patch_mean, patch_min
+from jaxsmooth.assembly import over_chosen, patch_mean, patch_min
 from jaxsmooth.guards.patch import PatchGuard
+from jaxsmooth.mesh.execution import Execution
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.metrics import evaluation as patches
 from jaxsmooth.motion.planar import Constraints
@@ -54,6 +55,27 @@ def test_patch_minimum_and_mean(name):
     values = tuple(jnp.asarray(rng.normal(size=len(nodes))) for nodes in blocks.values())
     np.testing.assert_array_equal(patch_min(mesh, values), per_node(mesh, values, min, np.inf))
     np.testing.assert_allclose(patch_mean(mesh, values), per_node(mesh, values, np.mean, 0), rtol=1e-13)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
+def test_only_the_chosen_are_looked_at(share):
+    chosen = np.random.default_rng(0).uniform(size=100) < share
+
+    def look(state, numbers):
+        seen, calls = state
+        return seen.at[numbers].add(1, mode="drop"), calls + 1
+
+    seen, calls = over_chosen(look, (jnp.zeros(100, int), 0), jnp.asarray(chosen), Execution(64))
+    np.testing.assert_array_equal(seen, chosen)
+    assert int(calls) == -(-chosen.sum() // 8)  # an eighth of a chunk at a time
+
+
+def test_portions_do_not_matter(name):
+    points, blocks = MESHES[name]()
+    move = jnp.asarray(random_move(points, 0.3))
+    first, second = (guarded(GUARD, Mesh(points, blocks, execution=Execution(n)), move) for n in (8, 4096))
+    np.testing.assert_array_equal(first.points, second.points)
+    assert int(first.shortened) == int(second.shortened) > 0
 
 
 def random_move(points, size, seed=0):

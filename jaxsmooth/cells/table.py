@@ -258,15 +258,18 @@ class ElementType:
         """The corners that edges join to one."""
         return [a + b - corner for a, b in self.family.edges if corner in (a, b)]
 
+    @property
+    def framed_corners(self) -> tuple[int, ...]:
+        """Corners that have a frame of edges: all but the apex of a pyramid."""
+        return tuple(corner for corner in range(self.corners) if corner not in self.singular_corners)
+
     @cached_property
     def corner_frames(self) -> Array:
         """Tangents of the edges leaving a corner: ``[c, k, dim]``, right-handed.
 
         ``Xᵀ frame`` has the edge tangents as its columns.  Singular corners are left out."""
         frames = []
-        for corner in range(self.corners):
-            if corner in self.singular_corners:
-                continue
+        for corner in self.framed_corners:
             directions = (self.natural[self._neighbours(corner)] - self.natural[corner]).T
             if np.linalg.det(directions) < 0:
                 directions = directions[:, [1, 0, *range(2, self.dim)]]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,11 +12,11 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsmooth.assembly import gather, patch_any, patch_min
+from jaxsmooth.assembly import elements_with, gather, over_chosen, patch_min
 from jaxsmooth.guards.acceptance import OPEN
 from jaxsmooth.guards.base import Guard, Guarded
 from jaxsmooth.mesh.record import Mesh
-from jaxsmooth.metrics.evaluation import Evaluation, evaluate
+from jaxsmooth.metrics.evaluation import Evaluation, evaluate_element, weight
 from jaxsmooth.metrics.summary import POOR
 from jaxsmooth.motion.base import Motion
 from jaxsmooth.numerics.small import Frame
@@ -93,19 +95,25 @@ class PatchGuard(Guard):
             """Nodes that stay; those that follow others stay where all of these do."""
             return ~admissible.led(count <= limit)
 
+        frame = Frame.of(frozen.points)
+
         def sweep(state):
-            count, _, bad, sweeps = state
-            count = count + admissible.together(bad)
-            after = evaluate(moved(frozen, path, plain, fraction(count, limit)))
-            return count, after, _offenders(frozen, needs, after, still(count)), sweeps + 1
+            count, points, after, bad, sweeps = state
+            together = admissible.together(bad)
+            count = count + together
+            now = moved(frozen, path, plain, fraction(count, limit)).points
+            # all others offend nobody, as before: who offends has a node that must move less
+            changed = (sweeps == 0) | together | (now != points).any(axis=1)
+            after, bad = _looked_at(frozen, frame.into(now), changed, still(count), needs, after)
+            return count, now, after, bad, sweeps + 1
 
         def unfinished(state):
-            count, _, bad, sweeps = state
+            count, _, _, bad, sweeps = state
             return (sweeps == 0) | (bad & ~still(count)).any()
 
         nothing = jnp.zeros(len(mesh.points), jnp.int32)
-        state = varying_like((nothing, start, nothing > 0, jnp.int32(0)), plain)
-        count, after, _, sweeps = jax.lax.while_loop(unfinished, sweep, state)
+        state = varying_like((nothing, frozen.points, start, nothing > 0, jnp.int32(0)), plain)
+        count, _, after, _, sweeps = jax.lax.while_loop(unfinished, sweep, state)
         part = checkpoint_name(fraction(count, limit), "accepted")
         return Guarded(moved(mesh, motion, move, part).points, after, (moves & (part < 1)).sum(), sweeps)
 
@@ -140,20 +148,48 @@ def _floor(
     return jnp.where(wanted, jnp.maximum(floor, keep * least), -jnp.inf), jnp.where(wanted, least, -jnp.inf)
 
 
-def _offenders(
-    mesh: Mesh, needs: _Needs, after: Evaluation, still: Bool[Array, " nodes"]
-) -> Bool[Array, " nodes"]:
-    """Nodes whose patch offends; of an element that offends a node that is still, all nodes."""
-    bad = []
-    for (_, nodes), need, q_need, det_need, corner_need, q, det, corner in zip(
-        mesh.blocks, *needs, *after, strict=True
+def _looked_at(
+    mesh: Mesh,
+    points: Field,
+    changed: Bool[Array, " nodes"],
+    still: Bool[Array, " nodes"],
+    needs: _Needs,
+    known: Evaluation,
+) -> tuple[Evaluation, Bool[Array, " nodes"]]:
+    """Elements with nodes that have changed are evaluated anew, at `points`; and nodes that these accuse.
+
+    Nodes whose patch offends; of an element that offends a node that is still, all nodes.
+    """
+    found, bad = [], jnp.zeros(len(changed), bool)
+    for (kind, nodes), chosen, *rows in zip(
+        mesh.blocks, elements_with(mesh, changed), *needs, *known, strict=True
     ):
-        own = ~(q[:, None] >= need)  # so written, NaN offends
-        whole = ~(q >= q_need) | ~(det > det_need) | (own & gather(still, nodes)).any(axis=1)
-        if corner is not None:
-            whole |= ~(corner >= corner_need)
-        bad.append(own | whole[:, None])
-    return patch_any(mesh, bad)
+        need, values = (tuple(row for row in part if row is not None) for part in (rows[:4], rows[4:]))
+
+        def look(state, numbers, kind=kind, nodes=nodes, need=need):
+            values, bad = state
+            corners, *least = (row.at[numbers].get(mode="clip") for row in (nodes, *need))
+            new = jax.vmap(partial(evaluate_element, kind))(gather(points, corners))
+            accused = _accused(least, new, gather(still, corners)) & (numbers < len(nodes))[:, None]
+            values = tuple(
+                old.at[numbers].set(part, mode="drop") for old, part in zip(values, new, strict=True)
+            )
+            return values, bad.at[corners].max(accused, mode="promise_in_bounds")
+
+        values, bad = over_chosen(look, (values, bad), chosen, mesh.execution, weight(kind))
+        found.append((*values, None)[:3])
+    return Evaluation(*zip(*found, strict=True)), bad
+
+
+def _accused(
+    need: Sequence[Array], new: Sequence[Array], still: Bool[Array, "elements k"]
+) -> Bool[Array, "elements k"]:
+    """Nodes that must move less for the sake of these elements."""
+    own = ~(new[0][:, None] >= need[0])  # so written, NaN offends
+    whole = (own & still).any(axis=1) | ~(new[0] >= need[1]) | ~(new[1] > need[2])
+    for corner, least in zip(new[2:], need[3:], strict=True):
+        whole |= ~(corner >= least)
+    return own | whole[:, None]
 
 
 def _extra_halvings(mesh: Mesh, move: Field, start: Evaluation) -> Int[Array, " nodes"]:

@@ -27,3 +27,9 @@ class Execution:
     def chunk(self, count: int, weight: int = 1) -> int:
         """Elements in a chunk of a block of `count`, for a function that needs `weight` times the memory."""
         return count if self.elements is None else min(count, max(self.elements // weight, 1))
+
+    def portion(self, count: int, weight: int = 1) -> int:
+        """Elements in a chunk where only a few of a block of `count` are wanted."""
+        wanted = _CACHED // 8 if self.elements is None else self.elements // 8
+        least = count // 16 if self.elements is None else 0  # a device is not busy with less
+        return min(count, max(wanted // weight, least, 1))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 from jaxtyping import Array, Float
@@ -14,11 +13,11 @@ from jaxsmooth.metrics.shape import min_jacobian, scaled_jacobian, shape_quality
 from jaxsmooth.metrics.validity import determinant_bound
 from jaxsmooth.numerics.small import Frame
 
-__all__ = ["Evaluation", "evaluate"]
+__all__ = ["Evaluation", "evaluate", "evaluate_element", "weight"]
 
 Blocks = tuple[Float[Array, " _"], ...]
 
-_HEAVY = 4  # memory of an evaluation at many points, in units of a product with linear tetrahedra
+_HEAVY = 4  # where many points are looked at
 
 
 class Evaluation(NamedTuple):
@@ -40,19 +39,27 @@ class Evaluation(NamedTuple):
 def evaluate(mesh: Mesh, beta: Float[Array, ""] | float = 2.0) -> Evaluation:
     """Quality, validity and corners of all elements."""
     points = Frame.of(mesh.points).into(mesh.points)
-
-    def element(kind: ElementType, _: None, nodes: Float[Array, "k dim"]) -> tuple[Array, ...]:
-        q = shape_quality(kind, nodes, beta)
-        if kind.constant_jacobian:  # a fair q means open corners
-            return q, min_jacobian(kind, nodes)
-        return q, determinant_bound(kind, nodes), scaled_jacobian(kind, nodes)
-
     found = [
         each(
-            partial(element, kind),
-            cut(nodes, None, mesh.execution, 1 if kind.constant_jacobian else _HEAVY),
+            lambda _, local, kind=kind: evaluate_element(kind, local, beta),
+            cut(nodes, None, mesh.execution, weight(kind)),
             points,
         )
         for kind, nodes in mesh.blocks
     ]
     return Evaluation(*zip(*((*values, None)[:3] for values in found), strict=True))
+
+
+def evaluate_element(
+    kind: ElementType, nodes: Float[Array, "k dim"], beta: Float[Array, ""] | float = 2.0
+) -> tuple[Float[Array, ""], ...]:
+    """Quality, bound of the determinant and, of types that have them, corners of one element."""
+    q = shape_quality(kind, nodes, beta)
+    if kind.constant_jacobian:  # a fair q means open corners
+        return q, min_jacobian(kind, nodes)
+    return q, determinant_bound(kind, nodes), scaled_jacobian(kind, nodes)
+
+
+def weight(kind: ElementType) -> int:
+    """Memory of an evaluation, in units of a product with linear tetrahedra."""
+    return 1 if kind.constant_jacobian else _HEAVY

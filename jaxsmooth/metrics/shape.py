@@ -87,16 +87,19 @@ def scaled_jacobian(kind: ElementType, nodes: Nodes) -> Scalar:
 
     The tᵢ are the tangents of the edges that leave the corner; the apex of a pyramid has no
     such frame and is left out.  The ideal value is 1 for quadrilaterals and hexahedra, √3/2
-    for triangles and wedges, √2/2 for tetrahedra and pyramids.
+    for triangles and wedges, √2/2 for tetrahedra and pyramids.  Where a tangent vanishes (a mid-side node at
+    the quarter of its edge) it has no direction, and the corner counts as closed: 0.
     """
-
-    def scaled(frames: Array) -> Array:
-        lengths = norm(jnp.swapaxes(frames, -1, -2)).prod(axis=-1)
-        return divide(determinant(frames), lengths, 0)
-
-    ideal = np.einsum("kd,qkj->qdj", kind.ideal, kind.corner_frames)
-    frames = contract(nodes, jnp.asarray(kind.corner_frames, nodes.dtype))
-    return least(scaled(frames) / scaled(jnp.asarray(ideal, frames.dtype)))
+    best = np.einsum("kd,qkj->qdj", kind.ideal, kind.corner_frames)
+    best = np.linalg.det(best) / np.linalg.norm(best, axis=1).prod(axis=-1)
+    slopes = jnp.asarray(kind.corner_frames, nodes.dtype)
+    # from the corner, so that a distance from the origin costs no digits
+    rays = nodes[None] - nodes[np.asarray(kind.framed_corners)][:, None]
+    frames = (rays[..., None] * slopes[:, :, None]).sum(axis=1)
+    lengths = norm(jnp.swapaxes(frames, -1, -2))
+    reach = (jnp.abs(rays).sum(axis=-1)[..., None] * jnp.abs(slopes)).sum(axis=1)
+    lengths = jnp.where(lengths > jnp.finfo(nodes.dtype).eps ** 0.5 * reach, lengths, 0)
+    return least(divide(determinant(frames), lengths.prod(axis=-1), 0) / jnp.asarray(best, nodes.dtype))
 
 
 def sample_gradients(kind: ElementType) -> np.ndarray:

@@ -105,9 +105,61 @@ class Directions:
         vector[np.abs(vector) < _SNAP] = 0
         return vector
 
+    def _flattened(self, plane: np.ndarray) -> Directions:
+        """With one vector for all facets that lie in one plane, as those around a node in a plane do.
+
+        It is as good as that of the largest of them, and counts as much: a node that is surrounded by tiny
+        ones may go far.  Where facets are off it by more than their tolerance the face is curved after all,
+        and keeps its own.
+
+        Args:
+            plane: nodes in planes ``[nodes]``.
+        """
+        face, number = self._faces(plane)
+        square, best = np.zeros((number, self.dim, self.dim)), np.zeros(number)
+        for which, (_, vectors, _, weight) in zip(face, self.parts, strict=True):
+            np.add.at(square, which, np.einsum("msi,msj,m->mij", vectors, vectors, weight))
+            np.maximum.at(best, which, weight)
+        common, agree = np.linalg.eigh(square)[1][..., -1], np.ones(number, bool)
+        cosines = [
+            np.einsum("msi,mi->ms", vectors, common[which])
+            for which, (_, vectors, *_) in zip(face, self.parts, strict=True)
+        ]
+        for which, cosine, (_, _, precision, _) in zip(face, cosines, self.parts, strict=True):
+            agree[which[((1 - cosine**2) * precision[:, None] > 1).any(axis=1)]] = False
+        flat = Directions(self.count, self.dim, self.size)
+        flat.joined = self.joined
+        for which, cosine, (nodes, vectors, precision, weight) in zip(face, cosines, self.parts, strict=True):
+            one = np.sign(cosine)[..., None] * common[which][:, None]
+            vectors = np.where(agree[which][:, None, None], one, vectors)
+            flat.parts.append((nodes, vectors, precision, np.where(agree[which], best[which], weight)))
+        return flat
+
+    def _faces(self, plane: np.ndarray) -> tuple[list[np.ndarray], int]:
+        """The face of each facet, part by part, and the number of faces: those share nodes in planes."""
+        first = self.count
+        pairs = [np.zeros((0, 2), int)]
+        for nodes, *_ in self.parts:
+            own = np.broadcast_to(first + np.arange(len(nodes))[:, None], nodes.shape)
+            pairs.append(np.stack([own, nodes], axis=-1)[plane[nodes]])
+            first += len(nodes)
+        ends = np.concatenate(pairs)
+        graph = coo_matrix((np.ones(len(ends), np.int8), ends.T), shape=(first, first))
+        found, face = np.unique(
+            connected_components(graph, directed=False)[1][self.count :], return_inverse=True
+        )
+        return np.split(face, np.cumsum([len(nodes) for nodes, *_ in self.parts])[:-1]), len(found)
+
     def null_space(self) -> tuple[np.ndarray, np.ndarray]:
         """Nodes that have vectors, and the projectors onto what is normal to all of them."""
         touched, rank, group = self._ranks()
+        plane = np.zeros(self.count, bool)
+        plane[touched[rank == 1]] = True
+        return self._flattened(plane)._normal_to_all(touched, rank, group)
+
+    def _normal_to_all(
+        self, touched: np.ndarray, rank: np.ndarray, group: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         free = np.zeros((len(touched), self.dim, self.dim))
         free[rank == 0] = np.eye(self.dim)
         open_ = np.flatnonzero((rank > 0) & (rank < self.dim))
