@@ -10,6 +10,7 @@ import numpy as np
 from meshio._mesh import topological_dimension
 
 from jaxsmooth.cells.table import TYPES, element_type, supported
+from jaxsmooth.mesh.record import check_size
 
 __all__ = [
     "SYNONYMS",
@@ -63,7 +64,7 @@ def dimension(name: str) -> int:
 
 
 def check_points(points: np.ndarray) -> None:
-    """Raise `MeshFileError` where coordinates are missing or not finite."""
+    """Raise `MeshFileError` where coordinates are missing, not finite, or of no size to compute with."""
     if points.ndim != 2 or points.shape[1] not in (2, 3) or points.dtype.kind not in "fiu":
         raise MeshFileError(
             f"the mesh has points of shape {list(points.shape)} ({points.dtype}); "
@@ -76,6 +77,10 @@ def check_points(points: np.ndarray) -> None:
             f"node {node} (counted from 0) has a coordinate that is not finite ({points[node].tolist()}), "
             f"{int((~finite).sum())} such nodes in all; repair or remove them"
         )
+    try:
+        check_size(points, np.finfo(points.dtype if points.dtype.kind == "f" else float))
+    except ValueError as error:
+        raise MeshFileError(str(error)) from error
 
 
 def element_dim(cells: Sequence[tuple[str, Any]]) -> int:

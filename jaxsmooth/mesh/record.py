@@ -17,7 +17,7 @@ from jaxsmooth.cells.table import ElementType, element_type
 from jaxsmooth.mesh.execution import Execution
 from jaxsmooth.mesh.links import NodeLinks
 
-__all__ = ["Labels", "Mesh"]
+__all__ = ["Labels", "Mesh", "check_size"]
 
 
 class Labels(eqx.Module):
@@ -150,12 +150,14 @@ def _as_points(points: Any) -> Float[Array, "nodes dim"]:
         # jnp.asarray rejects the big-endian arrays that some readers return
         dtype = np.float32 if array.dtype.itemsize <= 4 and array.dtype.kind == "f" else np.float64
         points = jnp.asarray(array.astype(dtype, copy=False))
-    _check_size(array, np.finfo(points.dtype))
+    check_size(array, np.finfo(points.dtype))
     return points
 
 
-def _check_size(points: np.ndarray, numbers: np.finfo) -> None:
-    """Fourth powers of lengths must neither over- nor underflow (the metric of a solid has them)."""
+def check_size(points: np.ndarray, numbers: np.finfo) -> None:
+    """Fourth powers of lengths must neither over- nor underflow (the metric of a solid has them).
+
+    Raises ValueError."""
     size = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
     if size and not float(numbers.tiny) ** 0.2 < size < float(numbers.max) ** 0.25 / 10:
         raise ValueError(
