@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from jaxsmooth import choices
 from jaxsmooth.convert.meshfile import MeshFile
@@ -19,7 +19,7 @@ from jaxsmooth.files.outputs import Outputs
 from jaxsmooth.methods import METHODS
 from jaxsmooth.metrics.table import USUAL
 from jaxsmooth.motion.detect import detect_constraints
-from jaxsmooth.report import advice, quality, report
+from jaxsmooth.report import advice, compared, quality, report
 from jaxsmooth.report.holding import holding
 from jaxsmooth.report.terminal import complain, sentence, write_to_standard_output
 from jaxsmooth.runs.driver import SmoothResult
@@ -241,15 +241,25 @@ def compare(options: argparse.Namespace, outputs: Outputs) -> int:
     report.print_file(out, file)
     constraints = choices.constraints_of(file, options)
     report.print_constraints(out, constraints, file.mesh)
-    rows = [report.compare_row("input", file.mesh, None, constraints, {})]
-    for name, method in methods.items():
-        clock = report.Clock()
-        with clock("smooth"):
-            result = choices.run_method(file, method, options.steps, constraints, None)
-        rows.append(report.compare_row(name, file.mesh, result, constraints, clock.split()))
-    report.print_compare(out, rows)
+    rows = [compared.compare_row("input", file.mesh, None, constraints, {})]
+    compared.print_head(out)
+    compared.print_row(out, rows[0])
+    columns = SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
+    with Progress(*columns, console=out, transient=True, disable=not out.is_terminal) as progress:
+        task = progress.add_task("", total=None)
+        for name, method in methods.items():
+            progress.reset(task, description=f"{name}: compiling and smoothing")
+            clock = report.Clock()
+            with clock("smooth"):
+                result = choices.run_method(file, method, options.steps, constraints, None)
+            rows.append(compared.compare_row(name, file.mesh, result, constraints, clock.split()))
+            compared.print_row(out, rows[-1])
+    compared.print_movable(out, rows)
+    best, words = compared.recommend(rows)
+    compared.print_advice(out, words)
     if options.json is not None:
         content = {"input": options.input, **report.counts(file.mesh), "methods": rows, "notes": file.notes}
+        content |= {"best": best, "advice": words}
         _write_json(outputs, options.json, content)
         _finish(out, outputs, "wrote {}")
     return DONE

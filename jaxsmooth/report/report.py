@@ -26,11 +26,10 @@ from jaxsmooth.runs.driver import SmoothResult, StepRecord
 __all__ = [
     "Clock",
     "as_json",
-    "compare_row",
     "console",
     "counts",
+    "finite",
     "movable_elements",
-    "print_compare",
     "print_comparison",
 ]
 
@@ -123,7 +122,7 @@ def as_json(
     notes: Sequence[str] = (),
 ) -> dict[str, Any]:
     """The documented JSON of ``smooth``; `notes` are those of the reader and of the writer."""
-    return _finite(
+    return finite(
         {
             "input": str(source),
             "output": str(output),
@@ -139,34 +138,15 @@ def as_json(
     )
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
     """JSON has no NaN: null stands for it."""
     if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
+        return {k: finite(v) for k, v in value.items()}
     if isinstance(value, list):
-        return [_finite(v) for v in value]
+        return [finite(v) for v in value]
     if isinstance(value, float | np.floating):
         return float(value) if math.isfinite(value) else None
     return value
-
-
-def compare_row(
-    name: str, mesh: Mesh, result: SmoothResult | None, constraints: Motion, seconds: dict
-) -> dict[str, Any]:
-    """One row of ``compare``: statistics over all and over movable elements, steps, seconds."""
-    final = mesh if result is None else result.mesh
-    masks = movable_elements(mesh, constraints)
-    return _finite(
-        {
-            "method": name,
-            "all": summarise(final),
-            "movable": summarise(final, masks),
-            "steps": 0 if result is None else len(result.history) - 1,
-            "status": "" if result is None else str(result.status),
-            "seconds": seconds.get("smooth", 0.0),
-            "compile_seconds": seconds.get("compile", 0.0),
-        }
-    )
 
 
 # --- Console ---------------------------------------------------------------------------
@@ -277,34 +257,3 @@ def print_comparison(out: Console, before: Mesh, result: SmoothResult) -> None:
             for m in (before, result.mesh)
         )
         out.print(f"{'area' if before.dim == 2 else 'volume'} changed by {(last - first) / first:+.2e}")
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.4g}"
-
-
-def print_compare(out: Console, rows: list[dict[str, Any]]) -> None:
-    """The tables of ``compare``: over all elements, and over those with a node that may move."""
-    last = ("steps", "seconds", "compile")
-    for part, title, heads in (
-        ("all", "all elements", ("q_min", "q_avg", "q<0.2", "sj_min", "inverted")),
-        ("movable", "with a node that may move", ("q_min", "q_avg", "q<0.2", *last)),
-    ):
-        table = Table(box=None, pad_edge=False, title=title, title_justify="left", title_style="bold")
-        for name in ("method", *heads):
-            table.add_column(name, justify="left" if name == "method" else "right", no_wrap=True)
-        for row in rows:
-            numbers = row[part]
-            cells = {
-                "q_min": _number(numbers.get("q_min")),
-                "q_avg": _number(numbers.get("q_avg")),
-                "q<0.2": f"{numbers.get('q_below_0.2', 0):,}",
-                "sj_min": _number(numbers.get("scaled_jacobian_min")),
-                "inverted": f"{numbers.get('inverted', 0):,}",
-                "steps": str(row["steps"]),
-                "seconds": f"{row['seconds']:.2f}",
-                "compile": f"{row['compile_seconds']:.1f}",
-            }
-            table.add_row(row["method"], *(cells[name] for name in heads))
-        out.print(table)
-    out.print("seconds are without compilation", style="dim")
