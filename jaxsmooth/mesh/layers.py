@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxsmooth.cells.table import ElementType
 from jaxsmooth.mesh.record import Mesh
-from jaxsmooth.mesh.topology import Facets, facet_keys, find_facets
+from jaxsmooth.mesh.topology import Facets, at_nodes, determinants, facet_keys, find_facets, frames_of
 
 __all__ = ["STRETCHED", "aspect_ratios", "boundary_layers", "layer_nodes", "nodes_of", "stretched"]
 
@@ -27,16 +27,8 @@ def aspect_ratios(kind: ElementType, points: np.ndarray, nodes: np.ndarray) -> n
     It is the ratio of the singular values of the mean deformation gradient from the ideal element;
     infinite for elements without measure.
     """
-    return _ratios(_frames(kind, points, nodes))
-
-
-def _frames(kind: ElementType, points: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Mean deformation gradients from the ideal element ``[elements, dim, dim]``."""
-    mean = np.einsum("q,qkd->kd", kind.weights, kind.gradients)
-    return np.swapaxes(np.asarray(points, np.float64)[nodes], 1, 2) @ mean
-
-
-def _ratios(frames: np.ndarray) -> np.ndarray:
+    mean = np.tensordot(kind.weights, kind.gradients, 1)
+    frames = np.swapaxes(np.asarray(points, np.float64)[nodes], 1, 2) @ mean
     square = np.einsum("edi,edj->eij", frames, frames)
     det, trace = np.abs(np.linalg.det(frames)), np.trace(square, axis1=1, axis2=2)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -56,17 +48,16 @@ def _stretched(kind: ElementType, points: np.ndarray, nodes: np.ndarray, beyond:
 
     det A over the mean square of A's singular values to the power of dim/2 is 1 for a cube; stretched
     by r it is at most what it is for (r, m, 1) with m² = (r² + 1)/2, in the plane for (r, 1)."""
-    frames = _frames(kind, points, nodes)
-    square = np.einsum("edi,edi->e", frames, frames) / kind.dim
+    corners = at_nodes(np.asarray(points, np.float64), nodes)
+    frames = frames_of(corners, np.tensordot(kind.weights, kind.gradients, 1)[None])
+    square = (frames * frames).sum(axis=(0, 1, 2)) / kind.dim
     if kind.dim == 2:
-        det = frames[:, 0, 0] * frames[:, 1, 1] - frames[:, 0, 1] * frames[:, 1, 0]
         most = 2 * beyond / (beyond**2 + 1)
     else:
-        det = np.einsum("ei,ei->e", frames[:, 0], np.cross(frames[:, 1], frames[:, 2]))
         most = beyond * ((beyond**2 + 1) / 2) ** 0.5 / ((beyond**2 + 1) / 2) ** 1.5
     found = np.zeros(len(nodes), bool)
-    rows = np.flatnonzero(np.abs(det) <= 1.01 * most * square ** (kind.dim / 2))
-    found[rows] = _ratios(frames[rows]) > beyond
+    rows = np.flatnonzero(np.abs(determinants(frames)[0]) <= 1.01 * most * square ** (kind.dim / 2))
+    found[rows] = aspect_ratios(kind, points, nodes[rows]) > beyond
     return found
 
 

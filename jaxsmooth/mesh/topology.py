@@ -14,7 +14,18 @@ from jaxsmooth.mesh.links import NodeLinks
 from jaxsmooth.mesh.memory import Remembered
 from jaxsmooth.mesh.record import Mesh
 
-__all__ = ["Facets", "facet_keys", "find_facets", "lengths", "node_pairs", "pair_codes", "signed_measures"]
+__all__ = [
+    "Facets",
+    "at_nodes",
+    "determinants",
+    "facet_keys",
+    "find_facets",
+    "frames_of",
+    "lengths",
+    "node_pairs",
+    "pair_codes",
+    "signed_measures",
+]
 
 
 @dataclass(frozen=True)
@@ -81,14 +92,20 @@ def facet_keys(corners: np.ndarray, count: int) -> np.ndarray:
     """One integer for every set of corner nodes ``[facets, c]`` of a mesh of `count` nodes."""
     ordered = _three_corners(corners).astype(np.int64)
     if count < 2**21:
-        base = np.int64(count)
-        return ordered @ base ** np.arange(ordered.shape[1])[::-1]
+        key = ordered[:, 0]
+        for column in ordered.T[1:]:
+            key = key * count + column
+        return key
     return np.unique(ordered, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _three_corners(corners: np.ndarray) -> np.ndarray:
     """The lowest three, sorted: enough to tell the faces of a solid apart."""
-    return np.sort(corners, axis=1)[:, :3]
+    if corners.shape[1] != 3:
+        return np.sort(corners, axis=1)[:, :3]
+    a, b, c = corners.T
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    return np.stack([np.minimum(low, c), np.maximum(low, np.minimum(high, c)), np.maximum(high, c)], axis=1)
 
 
 def _pair(keys: np.ndarray, regions: np.ndarray) -> np.ndarray:
@@ -143,7 +160,34 @@ def node_pairs(mesh: Mesh) -> np.ndarray:
     return np.stack([codes // len(mesh.points), codes % len(mesh.points)], axis=1)
 
 
+def at_nodes(points: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Coordinates ``[dim, k, elements]`` of the nodes ``[elements, k]``: NumPy is fast on long rows."""
+    return np.ascontiguousarray(np.asarray(points).T)[:, np.asarray(nodes).T]
+
+
+def frames_of(corners: np.ndarray, gradients: np.ndarray) -> np.ndarray:
+    """Deformation gradients ``[q, dim, dim, elements]`` of elements ``[dim, k, elements]``, on the host.
+
+    Those of natural derivatives ``[q, k, dim]``, of which most are zero for linear elements.
+    """
+    found = np.zeros((len(gradients), *corners.shape[:1], gradients.shape[2], corners.shape[2]))
+    for sample, node, column in np.argwhere(gradients):
+        found[sample, :, column] += gradients[sample, node, column] * corners[:, node]
+    return found
+
+
+def determinants(frames: np.ndarray) -> np.ndarray:
+    """Of matrices ``[…, dim, dim, elements]``."""
+    a = np.moveaxis(frames, (-3, -2), (0, 1))
+    if len(a) == 2:
+        return a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+    minors = (a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1], a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2])
+    return a[0, 0] * minors[0] + a[0, 1] * minors[1] + a[0, 2] * (a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0])
+
+
 def signed_measures(kind: ElementType, points: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """Signed area or volume of the elements ``[elements]``, on the host."""
-    frames = np.einsum("ekd,qkj->eqdj", np.asarray(points)[np.asarray(nodes)], kind.gradients)
-    return np.linalg.det(frames) @ kind.weights
+    if not len(nodes):
+        return np.zeros(0)
+    corners = at_nodes(np.asarray(points, np.float64), nodes)
+    return kind.weights @ determinants(frames_of(corners, kind.gradients))

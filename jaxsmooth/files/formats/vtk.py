@@ -12,7 +12,7 @@ from jaxtyping import Float
 from jaxsmooth.convert.checks import check_last_line
 from jaxsmooth.files.formats.meshios import read_copy
 from jaxsmooth.files.formats.record import Format, Holds, Patched, Source, UnpatchableError
-from jaxsmooth.files.formats.vtktext import with_sizes, without_text
+from jaxsmooth.files.formats.vtktext import lines_like, with_sizes, without_text
 from jaxsmooth.files.numbers import Places, put_binary, put_text, tokens
 from jaxsmooth.files.reduction import UNKEPT
 
@@ -41,23 +41,24 @@ def check_vtk(content: bytes, mesh: meshio.Mesh) -> None:
     lines = content[:4096].splitlines()
     if len(lines) > 2 and lines[2].strip().upper() == b"ASCII":
         check_last_line(content)
-    cells = sum(len(block) for block in mesh.cells)
+    cells, capitals = sum(len(block) for block in mesh.cells), content.upper()
     for key, found in (("POINTS", len(mesh.points)), ("CELL_TYPES", cells), ("CELL_DATA", cells)):
-        said = _counts(content, key)
+        said = _counts(capitals, key)
         if said and said[0] != found:
             raise ValueError(f"its section {key} says {said[0]}, the file has {found}; {_CUT}")
-    said = _counts(content, "CELLS")
+    said = _counts(capitals, "CELLS")
     if len(said) < 2 or any(block.type.startswith("poly") for block in mesh.cells):
         return
-    newer = re.search(rb"^OFFSETS\s", content, re.MULTILINE) is not None
+    newer = bool(lines_like(re.compile(rb"OFFSETS\s"), content, (b"OFFSETS",)))
     numbers = sum(block.data.size for block in mesh.cells)
     if said[1] != numbers + (0 if newer else cells):
         raise ValueError(f"its section CELLS has other numbers of nodes than its CELL_TYPES want; {_CUT}")
 
 
 def _counts(content: bytes, key: str) -> list[int]:
-    found = re.search(rb"^[ \t]*" + key.encode() + rb"[ \t]+(\d+)(?:[ \t]+(\d+))?", content, re.M | re.I)
-    return [] if found is None else [int(word) for word in found.groups() if word]
+    pattern = re.compile(rb"[ \t]*" + key.encode() + rb"[ \t]+(\d+)(?:[ \t]+(\d+))?")
+    found = lines_like(pattern, content, (key.encode(),))
+    return [int(word) for word in found[0].groups() if word] if found else []
 
 
 def pad_pairs(mesh: meshio.Mesh) -> None:
