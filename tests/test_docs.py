@@ -2,6 +2,7 @@
 
 import re
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import jax
@@ -102,6 +103,34 @@ def test_links_lead_somewhere(page):
         assert (folder / path).exists(), path
         heads = re.findall(r"^#+ (.*)$", (folder / path).read_text(), re.M) if anchor else []
         assert not anchor or anchor in [head.lower().replace(" ", "-") for head in heads]
+
+
+def test_the_method_names_code_that_is_there():
+    named = re.findall(r"`(jaxsmooth\.[\w.]+)`", (DOCS / "method.md").read_text())
+    assert len(named) > 15
+    for name in named:
+        home, _, own = name.rpartition(".")
+        assert (
+            find_spec(name)
+            if own.islower() and hasattr(import_module(home), "__path__")
+            else (hasattr(import_module(home), own))
+        )
+
+
+def test_the_comparison_says_what_was_measured():
+    """Every quality in it stands in the table of its mesh, and so do the numbers of poor elements."""
+    peers = (ROOT / "benchmarks" / "PEERS.md").read_text()
+    page = (DOCS / "others.md").read_text()
+    tables = {part.split(":")[0]: part for part in peers.split("\n## ")[2:]}
+    for mesh in set(re.findall(r"`(\w+_\w+|hexbend24)`", page)):
+        assert mesh in tables
+    for row in re.findall(r"^\| `(\w+)` \|(.*)$", page, re.M):
+        for number in re.findall(r"0\.\d{5}", row[1]):
+            assert number in tables[row[0]]
+    better = re.findall(r"^\| (\w+) \| .* \| (?!none)[^|]*\|$", peers.split("\n## ")[1], re.M)
+    assert sorted(set(better) - {"mesh"}) == sorted(re.findall(r"^\| `(\w+)` \|", page, re.M))
+    tangled = [t for t in tables.values() if int(re.search(r"^\| vtk .*", t, re.M)[0].split("|")[7])]
+    assert (len(tables), len(tangled)) == (19, 7)
 
 
 def test_the_site_has_all_pages():
