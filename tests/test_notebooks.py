@@ -1,5 +1,6 @@
 """Every notebook runs from top to bottom, at reduced size."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -25,13 +26,13 @@ def test_notebook_runs(path, monkeypatch):
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_is_small(path):
-    assert path.stat().st_size < 500_000, "draw smaller pictures before committing"
+    assert path.stat().st_size < 400_000, "draw smaller pictures before committing"
 
 
-@pytest.mark.parametrize("name", ["01_quickstart", "05_gmsh_in_place"])
+@pytest.mark.parametrize("name", ["01_quickstart", "03_gradients", "04_optimization", "05_gmsh_in_place"])
 def test_notebook_is_stored_with_its_pictures(name):
     notebook = nbformat.read(ROOT / "notebooks" / f"{name}.ipynb", as_version=4)
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     assert any("image/png" in output.get("data", {}) for output in outputs)
     assert all(output.output_type != "error" and output.get("name") != "stderr" for output in outputs)
-    assert str(ROOT) not in str(outputs)
+    assert not re.search(r"/(root|home|tmp|work|Users)/", str(outputs))
