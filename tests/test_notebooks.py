@@ -32,9 +32,7 @@ def test_notebook_is_small(path):
     assert path.stat().st_size < 400_000, "draw smaller pictures before committing"
 
 
-@pytest.mark.parametrize(
-    "path", [path for path in NOTEBOOKS if "02" not in path.stem], ids=lambda path: path.stem
-)
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_is_stored_with_its_pictures(path):
     notebook = nbformat.read(path, as_version=4)
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
