@@ -14,8 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
+from jaxsmooth.cells.table import ElementType
 from jaxsmooth.mesh.execution import Execution
 from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.numerics.tangent import flattened, lifted, tangent_frame
 from jaxsmooth.numerics.varying import varying_like
 
 __all__ = [
@@ -24,7 +26,9 @@ __all__ = [
     "cut",
     "each",
     "elements_with",
+    "frames_of",
     "gather",
+    "local_nodes",
     "mapped",
     "over_chosen",
     "patch_max",
@@ -33,6 +37,7 @@ __all__ = [
     "scan",
     "scatter_add",
     "sum_to_nodes",
+    "tangents",
 ]
 
 
@@ -49,6 +54,35 @@ def scatter_add(
     return start.at[nodes].add(values, mode="promise_in_bounds")
 
 
+def frames_of(
+    kind: ElementType,
+    points: Float[Array, "nodes dim"],
+    nodes: Int[Array, "elements k"],
+    normals: Float[Array, "elements 3"] | None,
+) -> Float[Array, "elements 2 3"] | None:
+    """The tangent frames (`tangent_frame`) of a block of a surface; None where there are no normals."""
+    if normals is None:
+        return None
+    return jax.vmap(tangent_frame)(gather(points, nodes[:, : kind.corners]), normals)
+
+
+def tangents(mesh: Mesh) -> tuple[Float[Array, "_ 2 3"] | None, ...]:
+    """The tangent frames of the elements of a surface at its present points; None for every other block."""
+    normals = (None,) * len(mesh.types) if mesh.normals is None else mesh.normals
+    return tuple(
+        frames_of(kind, mesh.points, nodes, up)
+        for (kind, nodes), up in zip(mesh.blocks, normals, strict=True)
+    )
+
+
+def local_nodes(
+    points: Float[Array, "nodes dim"], nodes: Int[Array, "*e k"], frames: Float[Array, "*e 2 3"] | None
+) -> Float[Array, "*e k local"]:
+    """Coordinates of the nodes of elements: in space, or in their tangent frames where there are such."""
+    values = gather(points, nodes)
+    return values if frames is None else flattened(values, frames)
+
+
 class Chunk(NamedTuple):
     """What a chunk function sees.
 
@@ -56,16 +90,23 @@ class Chunk(NamedTuple):
         nodes: connectivity ``[size, k]``.
         real: false for ghosts ``[size]``.
         data: arrays of the elements ``[size, …]``.
-        local: fields at the nodes of the elements ``[size, k, …]``.
+        local: fields at the nodes of the elements ``[size, k, …]``; vectors in their tangent frames, if any.
+        frames: tangent frames of the elements of a surface, or None.
     """
 
     nodes: Int[Array, "size k"]
     real: Bool[Array, " size"]
     data: Any
     local: Any
+    frames: Float[Array, "size 2 3"] | None = None
 
     def add(self, total: Array, contributions: Array) -> Array:
-        """`total` ``[nodes, …]`` plus contributions ``[size, k, …]``, but for those of ghosts."""
+        """`total` ``[nodes, …]`` plus contributions ``[size, k, …]``, but for those of ghosts.
+
+        With frames these are vectors or matrices in them, and are brought back to space.
+        """
+        if self.frames is not None:
+            contributions = lifted(contributions, self.frames)
         real = self.real.reshape(-1, *(1,) * (contributions.ndim - 1))
         return total.at[self.nodes].add(jnp.where(real, contributions, 0), mode="promise_in_bounds")
 
@@ -79,11 +120,21 @@ class Chunks(eqx.Module):
         nodes: connectivity.
         data: a pytree of arrays that belong to the elements.
         count: number of elements without ghosts (static).
+        frames: tangent frames of the elements of a surface, in which element functions see vectors; or None.
     """
 
     nodes: Int[Array, "chunks size k"]
     data: Any
     count: int = eqx.field(static=True)
+    frames: Float[Array, "chunks size 2 3"] | None = None
+
+    def holding(self, data: Any) -> Chunks:
+        """The same elements with other data."""
+        return Chunks(self.nodes, data, self.count, self.frames)
+
+    def local_nodes(self, points: Float[Array, "nodes dim"]) -> Float[Array, "chunks size k local"]:
+        """Coordinates of the nodes of all elements, as element functions see them."""
+        return local_nodes(points, self.nodes, self.frames)
 
     @property
     def real(self) -> Bool[Array, "chunks size"]:
@@ -96,7 +147,13 @@ class Chunks(eqx.Module):
         return values.reshape(-1, *values.shape[2:])[: self.count]
 
 
-def cut(nodes: Int[Array, "elements k"], data: Any, execution: Execution, weight: int = 1) -> Chunks:
+def cut(
+    nodes: Int[Array, "elements k"],
+    data: Any,
+    execution: Execution,
+    weight: int = 1,
+    frames: Float[Array, "elements 2 3"] | None = None,
+) -> Chunks:
     """Cut a block, and the data of its elements, into chunks.
 
     Args:
@@ -104,10 +161,11 @@ def cut(nodes: Int[Array, "elements k"], data: Any, execution: Execution, weight
         data: a pytree of arrays ``[elements, …]``, or None.
         execution: how the loop runs.
         weight: memory that the element function needs, in units of a product with linear tetrahedra.
+        frames: those of `tangents`, where the element function is one of plane elements.
     """
     count = len(nodes)
     fold = _folded(count, execution.chunk(count, weight))
-    return Chunks(fold(nodes), jax.tree.map(fold, data), count)
+    return Chunks(fold(nodes), jax.tree.map(fold, data), count, None if frames is None else fold(frames))
 
 
 def _folded(count: int, size: int) -> Callable[[Array], Array]:
@@ -138,12 +196,12 @@ def scan(
     """
 
     def visit(carry, chunk):
-        nodes, real, data = chunk
-        local = jax.tree.map(lambda field: gather(field, nodes), fields)
-        return function(carry, Chunk(nodes, real, data, local))
+        nodes, real, data, frames = chunk
+        local = jax.tree.map(lambda field: local_nodes(field, nodes, frames), fields)
+        return function(carry, Chunk(nodes, real, data, local, frames))
 
     start = varying_like(start, (chunks, fields))
-    return jax.lax.scan(visit, start, (chunks.nodes, chunks.real, chunks.data))
+    return jax.lax.scan(visit, start, (chunks.nodes, chunks.real, chunks.data, chunks.frames))
 
 
 def each(function: Callable[..., Any], chunks: Chunks, fields: Any) -> Any:

@@ -178,7 +178,7 @@ def _add_motion_options(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     choices = ("slide", "planar", "fixed")
     help = "boundary nodes slide on faces and edges, planar: on flat and straight ones only, or are fixed"
-    add("--boundary", choices=choices, default="planar", help=f"{help} (default: planar)")
+    add("--boundary", choices=choices, help=f"{help} (default: planar; of surfaces slide)")
     help = "the same for the nodes between materials (default: planar)"
     add("--interfaces", choices=choices, default="planar", help=help)
     help = "the nodes of boundary layers: hold them, or free (default: hold)"

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsmooth.assembly import cut, each, gather, patch_mean
+from jaxsmooth.assembly import cut, each, gather, patch_mean, tangents
 from jaxsmooth.cells.table import ElementType
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.metrics.table import measure
@@ -81,17 +81,21 @@ class GivenSize(Target):
     def measures(self, mesh: Mesh, frame: Frame) -> Measures:
         """The sizes, in the units of the frame."""
         given = self.size if isinstance(self.size, tuple) else (self.size,) * len(mesh.blocks)
-        dtype, unit = mesh.points.dtype, frame.scale**mesh.dim
+        dtype = mesh.points.dtype
         return tuple(
-            jnp.ones(len(nodes), dtype) * jnp.asarray(size, dtype) * unit
-            for size, nodes in zip(given, mesh.connectivity, strict=True)
+            jnp.ones(len(nodes), dtype) * jnp.asarray(size, dtype) * frame.scale**kind.dim
+            for size, (kind, nodes) in zip(given, mesh.blocks, strict=True)
         )
 
 
 def _each(function: Callable[..., Array], mesh: Mesh) -> Measures:
     return tuple(
-        each(lambda _, local, kind=kind: function(kind, local), cut(nodes, None, mesh.execution), mesh.points)
-        for kind, nodes in mesh.blocks
+        each(
+            lambda _, local, kind=kind: function(kind, local),
+            cut(nodes, None, mesh.execution, frames=frames),
+            mesh.points,
+        )
+        for (kind, nodes), frames in zip(mesh.blocks, tangents(mesh), strict=True)
     )
 
 

@@ -322,7 +322,6 @@ def changed(array, at, value):
 
 
 POINTS, QUADS = grid()
-BALL = POINTS * [1, 1, 0] + np.stack([0 * POINTS[:, 0], 0 * POINTS[:, 0], POINTS[:, 0] ** 2], axis=1)
 
 
 @pytest.mark.parametrize(
@@ -336,7 +335,6 @@ BALL = POINTS * [1, 1, 0] + np.stack([0 * POINTS[:, 0], 0 * POINTS[:, 0], POINTS
             [("quad", QUADS), ("polyhedron4", [[[0, 1, 2]]])],
             r"not supported: polyhedron4 \(1 cells\)",
         ),
-        (BALL, [("quad", QUADS)], "surface in 3D"),
         (POINTS[:, :2], [("tetra", [[0, 1, 5, 6]])], "only two coordinates"),
         (changed(POINTS, (4, 1), np.inf), [("quad", QUADS)], "node 4 .*not finite.* 1 such nodes"),
         (changed(POINTS, (4, 2), np.nan), [("quad", QUADS)], "node 4 .*not finite"),

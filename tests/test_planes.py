@@ -71,10 +71,12 @@ def test_noise_off_the_plane_is_kept(noise):
 
 @pytest.mark.parametrize("bow", [1e-4, 0.1])
 @pytest.mark.parametrize("turn", [None, meshes.rotation_matrix(3, 5)])
-def test_surfaces_are_refused(bow, turn):
+def test_surfaces_are_no_planes(bow, turn):
     points = in_space(normal=bow * FLAT[:, 0] ** 2, turn=turn)
-    with pytest.raises(MeshFileError, match="surface in 3D"):
-        js.from_meshio(meshio.Mesh(points, BLOCKS))
+    file = js.from_meshio(meshio.Mesh(points, BLOCKS))
+    assert file.plane is None
+    assert file.mesh.surface
+    np.testing.assert_array_equal(file.mesh.points, points)
 
 
 def test_points_in_the_plane_have_no_plane():

@@ -156,7 +156,7 @@ def test_smooth_refuses_traced_points(square):
             {"triangle": [[0, 1, 2]]},
             "node 1 has a coordinate that is not finite",
         ),
-        ([[0, 0, 0], [1, 0, 0], [0, 1, 1]], {"triangle": [[0, 1, 2]]}, "surface elements in 3D"),
+        ([[0, 0], [1, 0], [0, 1], [1, 1]], {"tetra": [[0, 1, 2, 3]]}, "3D elements in 2D space"),
         ([[0, 0], [1, 0], [0, 1]], {"polygon": [[0, 1, 2]]}, "'polygon' is not supported"),
         ([[0, 0], [1, 0], [0, 1]], {}, "no element blocks"),
     ],

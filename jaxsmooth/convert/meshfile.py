@@ -83,9 +83,10 @@ def from_meshio(
     Cell blocks of one type become one element block; elements that are numbered the other way round
     are mirrored (in `mesh`, not in `source`); lower-dimensional cells and material tags become
     `Mesh.labels`.  The mesh is 2D when its highest cells are and all of them lie in one plane, whichever
-    (but for noise of 1e-5 of its size).  Nodes that belong together (periodic pairs, parts in contact,
-    hanging nodes, the two sides of cohesive cells) are `Labels.links`; nodes that the file marks, and those
-    of shells in a solid, are `Labels.held`.  Elements without thickness (cohesive cells) are left out.
+    (but for noise of 1e-5 of its size); else such cells are a surface in space.  Nodes that belong
+    together (periodic pairs, parts in contact, hanging nodes, the two sides of cohesive cells) are
+    `Labels.links`; nodes that the file marks, and those of shells in a solid, are `Labels.held`.  Elements
+    without thickness (cohesive cells) are left out.
 
     Args:
         source: what meshio read.
@@ -94,8 +95,8 @@ def from_meshio(
         dtype: float32 or float64; by default that of the points (as far as JAX allows it).
 
     Raises:
-        MeshFileError: no elements, none with a thickness, types that are not supported, surfaces in
-            3D, coordinates that are not finite, elements that refer to missing nodes or to one node twice.
+        MeshFileError: no elements, none with a thickness, types that are not supported, coordinates that
+            are not finite, elements that refer to missing nodes or to one node twice.
     """
     points = plain(source.points)
     cells = [(SYNONYMS.get(c.type, c.type), c.data) for c in source.cells]
@@ -124,7 +125,7 @@ def from_meshio(
         mesh,
         [cell for k, cell in enumerate(cells) if k not in chosen],
         getattr(source, "gmsh_periodic", None),
-        np.eye(3)[:dim] if plane is None else plane.axes,
+        np.eye(3)[: mesh.dim] if plane is None else plane.axes,
         facing,
     )
     held = fixed | together.held
@@ -288,7 +289,7 @@ def _in_space(points: np.ndarray, numbering, dim: int) -> tuple[np.ndarray, Plan
     if dim == 3 or points.shape[1] == 2:
         return points, None
     plane = find_plane(points[np.unique(np.concatenate([nodes.ravel() for nodes in numbering]))])
-    return plane.flatten(points), plane
+    return (points, None) if plane is None else (plane.flatten(points), plane)
 
 
 # --- To the source -----------------------------------------------------------------------

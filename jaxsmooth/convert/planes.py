@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxsmooth.convert.checks import MeshFileError
-
 __all__ = ["Plane", "find_plane"]
 
 # Of the size of a mesh.  Six digits, as text files have them, round to 5e-6 of the largest coordinate,
@@ -57,12 +55,8 @@ class Plane:
         return out
 
 
-def find_plane(points: np.ndarray) -> Plane:
-    """The plane in which points ``[nodes, 3]`` lie but for noise (1e-5 of their size).
-
-    Raises:
-        MeshFileError: they lie in none.
-    """
+def find_plane(points: np.ndarray) -> Plane | None:
+    """The plane in which points ``[nodes, 3]`` lie but for noise (1e-5 of their size); None if in none."""
     points = np.asarray(points, np.float64)
     extent = np.ptp(points, axis=0)
     normal = 2 if extent[2] <= _FLAT * extent[:2].max() else int(extent.argmin())
@@ -75,10 +69,7 @@ def find_plane(points: np.ndarray) -> Plane:
     _, directions = np.linalg.eigh((points - origin).T @ (points - origin))
     away = directions[:, 0]
     if np.ptp((points - origin) @ away) > _FLAT * extent.max():
-        raise MeshFileError(
-            "the mesh is a surface in 3D (plane elements that lie in no common plane), which can't be "
-            "smoothed; give volume elements, or a plane mesh"
-        )
+        return None
     return Plane(origin, _axes(away), None)
 
 

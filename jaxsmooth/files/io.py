@@ -145,7 +145,7 @@ def write_to(
     try:
         with outputs.file(path) as part:
             if patched is None:
-                notes += write_source(part, mesh, name, file.mesh.dim)
+                notes += write_source(part, mesh, name, file.mesh.element_dim)
             else:
                 _write_patched(outputs, part, patched)
                 notes += patched.notes

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsmooth.assembly import elements_with, gather, over_chosen, patch_min
+from jaxsmooth.assembly import elements_with, frames_of, gather, local_nodes, over_chosen, patch_min
 from jaxsmooth.guards.acceptance import OPEN
 from jaxsmooth.guards.base import Guard, Guarded
 from jaxsmooth.mesh.record import Mesh
@@ -161,15 +161,18 @@ def _looked_at(
     Nodes whose patch offends; of an element that offends a node that is still, all nodes.
     """
     found, bad = [], jnp.zeros(len(changed), bool)
-    for (kind, nodes), chosen, *rows in zip(
-        mesh.blocks, elements_with(mesh, changed), *needs, *known, strict=True
+    normals = mesh.normals or (None,) * len(mesh.types)
+    for (kind, nodes), up, chosen, *rows in zip(
+        mesh.blocks, normals, elements_with(mesh, changed), *needs, *known, strict=True
     ):
         need, values = (tuple(row for row in part if row is not None) for part in (rows[:4], rows[4:]))
 
-        def look(state, numbers, kind=kind, nodes=nodes, need=need):
+        def look(state, numbers, kind=kind, nodes=nodes, up=up, need=need):
             values, bad = state
             corners, *least = (row.at[numbers].get(mode="clip") for row in (nodes, *need))
-            new = jax.vmap(partial(evaluate_element, kind))(gather(points, corners))
+            up = None if up is None else up.at[numbers].get(mode="clip")
+            local = local_nodes(points, corners, frames_of(kind, points, corners, up))
+            new = jax.vmap(partial(evaluate_element, kind))(local)
             accused = _accused(least, new, gather(still, corners)) & (numbers < len(nodes))[:, None]
             values = tuple(
                 old.at[numbers].set(part, mode="drop") for old, part in zip(values, new, strict=True)
@@ -194,7 +197,9 @@ def _accused(
 
 def _extra_halvings(mesh: Mesh, move: Field, start: Evaluation) -> Int[Array, " nodes"]:
     """Halvings that make a move as short as the least element around its node is large."""
-    sizes = tuple(jnp.abs(det) ** (1 / mesh.dim) for det in start.jacobian)
+    sizes = tuple(
+        jnp.abs(det) ** (1 / kind.dim) for (kind, _), det in zip(mesh.blocks, start.jacobian, strict=True)
+    )
     local = patch_min(mesh, sizes)
     length = jnp.abs(move).max(axis=-1) * Frame.of(mesh.points).scale
     ratio = jnp.where(jnp.isfinite(length) & (local > 0), length / jnp.where(local > 0, local, 1), 1)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsmooth.assembly import gather, patch_max, patch_min
+from jaxsmooth.assembly import gather, local_nodes, patch_max, patch_min, tangents
 from jaxsmooth.guards.base import Guard, Guarded
 from jaxsmooth.guards.patch import PatchGuard
 from jaxsmooth.mesh.record import Mesh
@@ -88,9 +88,10 @@ def gains(mesh: Mesh, motion: Motion, move: Field, before: Evaluation, noise) ->
     """
     after = []
     move = motion.retract(mesh.points, move) - mesh.points
-    for (kind, nodes), det in zip(mesh.blocks, before.jacobian, strict=True):
+    for (kind, nodes), frames, det in zip(mesh.blocks, tangents(mesh), before.jacobian, strict=True):
         alone = jnp.eye(kind.k, dtype=mesh.points.dtype)[:, :, None]
-        variants = gather(mesh.points, nodes)[:, None] + alone * gather(move, nodes)[:, None]
+        local = local_nodes(mesh.points, nodes, frames)
+        variants = local[:, None] + alone * local_nodes(move, nodes, frames)[:, None]
         each = jax.vmap(jax.vmap(partial(shape_quality, kind)))(variants)
         turned = ~(jax.vmap(jax.vmap(partial(min_jacobian, kind)))(variants) > 0) & (det > 0)[:, None]
         after.append(jnp.where(turned, -jnp.inf, each))

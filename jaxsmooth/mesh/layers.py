@@ -29,6 +29,7 @@ def aspect_ratios(kind: ElementType, points: np.ndarray, nodes: np.ndarray) -> n
     """
     mean = np.tensordot(kind.weights, kind.gradients, 1)
     frames = np.swapaxes(np.asarray(points, np.float64)[nodes], 1, 2) @ mean
+    frames = frames if frames.shape[1] == kind.dim else np.linalg.qr(frames)[1]
     square = np.einsum("edi,edj->eij", frames, frames)
     det, trace = np.abs(np.linalg.det(frames)), np.trace(square, axis1=1, axis2=2)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -101,6 +102,8 @@ def boundary_layers(mesh: Mesh, facets: Sequence[Facets] | None = None) -> tuple
         One mask ``[elements]`` a block.
     """
     points, count = np.asarray(mesh.points, np.float64), len(mesh.points)
+    if mesh.surface:  # they are known in plane and solid meshes only
+        return tuple(np.zeros(len(nodes), bool) for nodes in mesh.connectivity)
     blocks = [(kind, np.asarray(nodes)) for kind, nodes in mesh.blocks]
     upright = [_upright(kind, points, nodes) for kind, nodes in blocks]
     if not any(rows.any() for rows in upright):

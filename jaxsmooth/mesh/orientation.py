@@ -38,17 +38,21 @@ def orient(points: np.ndarray, blocks: Sequence[tuple[ElementType, np.ndarray]])
 
     Elements connected through facets are brought to one common numbering; its sign is that of
     their summed signed measure, which depends on the boundary only, however tangled the inside.
+    Those of a surface in space are numbered as most of its area is.
 
     Args:
         points: coordinates ``[nodes, dim]``.
         blocks: element types with connectivity ``[elements, k]``.
     """
     measures = [signed_measures(kind, points, nodes) for kind, nodes in blocks]
-    if all(m.min(initial=0.0) >= 0 for m in measures):  # nothing to tell apart
+    flat = points.shape[1] == blocks[0][0].dim
+    if flat and all(m.min(initial=0.0) >= 0 for m in measures):  # nothing to tell apart
         return Orientation(tuple(np.zeros(len(m), bool) for m in measures), tuple(measures))
     whole = np.concatenate([np.full(len(m), bool((m < 0).all())) for m in measures])
     reverse = _reversed(*_neighbours(blocks, len(points)), np.concatenate(measures), whole)
     parts = np.split(reverse, np.cumsum([len(m) for m in measures])[:-1])
+    if not flat:  # areas
+        return Orientation(tuple(parts), tuple(measures))
     return Orientation(tuple(parts), tuple(np.where(r, -m, m) for r, m in zip(parts, measures, strict=True)))
 
 

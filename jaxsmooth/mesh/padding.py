@@ -64,7 +64,7 @@ def padded(mesh: Mesh) -> Padded:
     connectivity, start = [], own.nodes
     for kind, nodes in zip(kinds, mesh.connectivity, strict=True):
         ideal = kind.ideal - kind.ideal.min(axis=0)
-        places[0][start - own.nodes : start - own.nodes + kind.k] = ideal / ideal.max()
+        places[0][start - own.nodes : start - own.nodes + kind.k, : kind.dim] = ideal / ideal.max()
         ghost = np.arange(start, start + kind.k, dtype=np.int32)
         fill = np.tile(ghost, (_size(len(nodes)) - len(nodes), 1))
         connectivity.append(jnp.asarray(np.concatenate([np.asarray(nodes), fill])))
@@ -74,6 +74,14 @@ def padded(mesh: Mesh) -> Padded:
     ghosts = (low + scale * places[0]).astype(points.dtype)
     new = jnp.asarray(np.concatenate([points, ghosts]))
     whole = eqx.tree_at(lambda m: (m.points, m.connectivity), mesh, (new, tuple(connectivity)))
+    if mesh.normals is not None:
+        fills = [len(nodes) - count for nodes, count in zip(connectivity, own.elements, strict=True)]
+        up = jnp.asarray([0, 0, 1], mesh.points.dtype)
+        normals = [
+            jnp.concatenate([part, jnp.tile(up, (fill, 1))])
+            for part, fill in zip(mesh.normals, fills, strict=True)
+        ]
+        whole = eqx.tree_at(lambda m: m.normals, whole, tuple(normals))
     return Padded(whole, own.nodes, own.elements)
 
 

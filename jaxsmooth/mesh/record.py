@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsmooth.cells.table import ElementType, element_type
 from jaxsmooth.mesh.execution import Execution
 from jaxsmooth.mesh.links import NodeLinks
+from jaxsmooth.mesh.normals import reference_normals
 
 __all__ = ["Labels", "Mesh", "check_size"]
 
@@ -48,6 +49,8 @@ class Mesh(eqx.Module):
         points: coordinates of the nodes ``[nodes, dim]``; their dtype sets the precision.
         connectivity: one int32 array ``[elements, k]`` an element block.
         labels: regions and lower-dimensional cells, or None.
+        normals: of a surface in space the normals ``[elements, 3]`` of what was given, one array a block,
+            against which elements are valid or inverted; None for all other meshes.
         types: the element type of each block, by meshio's name (static).
         execution: how loops over the elements run (static).
     """
@@ -55,6 +58,7 @@ class Mesh(eqx.Module):
     points: Float[Array, "nodes dim"]
     connectivity: tuple[Int[Array, "_ _"], ...]
     labels: Labels | None
+    normals: tuple[Float[Array, "_ 3"], ...] | None
     types: tuple[str, ...] = eqx.field(static=True)
     execution: Execution = eqx.field(static=True)
 
@@ -66,6 +70,8 @@ class Mesh(eqx.Module):
         execution: Execution | None = None,
     ):
         """Check and build a mesh.
+
+        Plane elements in space are a surface; neighbours have to be numbered alike (`as_mesh` sees to it).
 
         Args:
             points: ``[nodes, dim]`` coordinates, float32 or float64.
@@ -86,13 +92,24 @@ class Mesh(eqx.Module):
         self.points = points
         self.connectivity = tuple(jnp.asarray(nodes.astype(np.int32)) for _, nodes in pairs)
         self.labels = labels
+        self.normals = _normals(points, pairs)
         self.types = tuple(name for name, _ in pairs)
         self.execution = Execution.here() if execution is None else execution
 
     @property
     def dim(self) -> int:
-        """Dimension of the space and of the elements: 2 or 3."""
+        """Dimension of the space: 2 or 3; that of the elements too, but for surfaces."""
         return self.points.shape[1]
+
+    @property
+    def element_dim(self) -> int:
+        """Dimension of the elements: 2 or 3."""
+        return element_type(self.types[0]).dim
+
+    @property
+    def surface(self) -> bool:
+        """Whether the elements are plane ones in space."""
+        return self.normals is not None
 
     @property
     def blocks(self) -> list[tuple[ElementType, Int[Array, "elements k"]]]:
@@ -165,13 +182,29 @@ def check_size(points: np.ndarray, numbers: np.finfo) -> None:
         )
 
 
+def _normals(points: Any, pairs: list[tuple[str, np.ndarray]]) -> tuple[Float[Array, "_ 3"], ...] | None:
+    """Reference normals of a surface, None for other meshes."""
+    blocks = [(element_type(name), nodes) for name, nodes in pairs]
+    dims = {kind.dim for kind, _ in blocks}
+    if len(dims) > 1:
+        raise ValueError(
+            f"the element blocks ({', '.join(name for name, _ in pairs)}) are of different dimensions; give "
+            "the solid or the surface alone"
+        )
+    if dims == {points.shape[1]}:
+        return None
+    if isinstance(points, Tracer):
+        raise ValueError(
+            "the normals of a surface can't be found while JAX traces its points; build the mesh before, and "
+            "trace mesh.with_points(points)"
+        )
+    found = reference_normals(np.asarray(points), blocks)
+    return tuple(jnp.asarray(part, points.dtype) for part in found)
+
+
 def _check_block(index: int, name: str, nodes: np.ndarray, points_shape: tuple[int, ...]) -> None:
     kind, where = element_type(name), f"block {index} ({name})"
-    if kind.dim != points_shape[1]:
-        if kind.dim == 2 and points_shape[1] == 3:
-            raise ValueError(
-                f"{where}: surface elements in 3D can't be smoothed; give 2D points or volume elements"
-            )
+    if kind.dim != points_shape[1] and (kind.dim, points_shape[1]) != (2, 3):
         raise ValueError(f"{where}: {kind.dim}D elements in {points_shape[1]}D space can't be smoothed")
     if nodes.ndim != 2 or nodes.shape[1] != kind.k or nodes.dtype.kind not in "iu":
         raise ValueError(

@@ -21,6 +21,7 @@ __all__ = [
     "facet_keys",
     "find_facets",
     "frames_of",
+    "kept_facets",
     "lengths",
     "node_pairs",
     "pair_codes",
@@ -47,6 +48,19 @@ class Facets:
     def select(self, chosen: np.ndarray) -> Facets:
         """The facets of a mask ``[facets]``."""
         return Facets(self.type, self.nodes[chosen], self.region[chosen], self.partner[chosen])
+
+
+def kept_facets(mesh: Mesh) -> list[Facets]:
+    """The facets whose shape is kept: those of a solid or a plane mesh, and the elements of a surface.
+
+    A surface is a boundary with nothing behind it: its elements have ``partner == -1``.
+    """
+    if not mesh.surface:
+        return find_facets(mesh)
+    parts = zip(mesh.blocks, _regions(mesh), strict=True)
+    return [
+        Facets(kind, np.asarray(nodes), region, np.full(len(nodes), -1)) for (kind, nodes), region in parts
+    ]
 
 
 _FACETS: Remembered[list[Facets]] = Remembered()
@@ -177,8 +191,10 @@ def frames_of(corners: np.ndarray, gradients: np.ndarray) -> np.ndarray:
 
 
 def determinants(frames: np.ndarray) -> np.ndarray:
-    """Of matrices ``[…, dim, dim, elements]``."""
+    """Of matrices ``[…, dim, dim, elements]``; of ``[…, 3, 2, elements]`` the area, which has no sign."""
     a = np.moveaxis(frames, (-3, -2), (0, 1))
+    if a.shape[:2] == (3, 2):
+        return np.linalg.norm(np.cross(a[:, 0], a[:, 1], axis=0), axis=0)
     if len(a) == 2:
         return a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
     minors = (a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1], a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2])
@@ -186,7 +202,7 @@ def determinants(frames: np.ndarray) -> np.ndarray:
 
 
 def signed_measures(kind: ElementType, points: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Signed area or volume of the elements ``[elements]``, on the host."""
+    """Signed area or volume of the elements ``[elements]``, on the host; areas in space have no sign."""
     if not len(nodes):
         return np.zeros(0)
     corners = at_nodes(np.asarray(points, np.float64), nodes)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsmooth.assembly import gather, scatter_add
+from jaxsmooth.assembly import gather, local_nodes, scatter_add, tangents
 from jaxsmooth.cells.table import ElementType
 from jaxsmooth.guards.base import Guard
 from jaxsmooth.guards.smart import SmartGuard
@@ -77,8 +77,10 @@ class Laplacian(Method):
 
     def _to_centroids(self, mesh: Mesh) -> Field:
         total = jnp.zeros((len(mesh.points), mesh.dim + 1), mesh.points.dtype)
-        for kind, nodes in mesh.blocks:
-            moments = jax.vmap(partial(_moments, kind))(gather(mesh.points, nodes))
+        for (kind, nodes), frames in zip(mesh.blocks, tangents(mesh), strict=True):
+            places = gather(mesh.points, nodes)
+            flat = local_nodes(mesh.points, nodes, frames)
+            moments = jax.vmap(partial(_moments, kind))(places, flat)
             spread = jnp.broadcast_to(moments[:, None], (*nodes.shape, mesh.dim + 1))
             total = total + scatter_add(spread, nodes, len(mesh.points))
         return _mean(total, mesh.points)
@@ -91,12 +93,14 @@ def _mean(total: Float[Array, "nodes _"], points: Field) -> Field:
     return jnp.where(known, total[:, :-1] / jnp.where(known, weight, 1) - points, 0)
 
 
-def _moments(kind: ElementType, nodes: Float[Array, "k dim"]) -> Float[Array, " _"]:
+def _moments(
+    kind: ElementType, nodes: Float[Array, "k dim"], local: Float[Array, "k local"]
+) -> Float[Array, " _"]:
     """Integrals ``(∫ x |dV|, ∫ |dV|)`` of an element: V C and V of Eq. 38.
 
-    Not C itself, which a flat element does not have.
+    Not C itself, which a flat element does not have.  `local` are its nodes in its own plane, if it has one.
     """
-    frames = contract(nodes, jnp.asarray(kind.gradients, nodes.dtype))
+    frames = contract(local, jnp.asarray(kind.gradients, nodes.dtype))
     parts = jnp.abs(determinant(frames)) * jnp.asarray(kind.weights, nodes.dtype)
     places = jnp.asarray(kind.values, nodes.dtype) @ nodes
     return jnp.append(parts @ places, parts.sum())

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from jaxtyping import Array, Float
 
-from jaxsmooth.assembly import cut, each
+from jaxsmooth.assembly import cut, each, tangents
 from jaxsmooth.cells.table import ElementType
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.metrics.shape import min_jacobian, scaled_jacobian, shape_quality
@@ -42,10 +42,10 @@ def evaluate(mesh: Mesh, beta: Float[Array, ""] | float = 2.0) -> Evaluation:
     found = [
         each(
             lambda _, local, kind=kind: evaluate_element(kind, local, beta),
-            cut(nodes, None, mesh.execution, weight(kind)),
+            cut(nodes, None, mesh.execution, weight(kind), frames),
             points,
         )
-        for kind, nodes in mesh.blocks
+        for (kind, nodes), frames in zip(mesh.blocks, tangents(mesh), strict=True)
     ]
     return Evaluation(*zip(*((*values, None)[:3] for values in found), strict=True))
 

@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxsmooth.assembly import gather
+from jaxsmooth.assembly import local_nodes, tangents
 from jaxsmooth.convert.meshfile import as_mesh
 from jaxsmooth.mesh.memory import Remembered
 from jaxsmooth.mesh.padding import Padded, padded
@@ -94,8 +94,8 @@ def _scaled(whole: Padded, evaluation: Evaluation) -> tuple[Float[Array, " _"], 
 @partial(jax.jit, static_argnames=("wanted",))
 def _corners(mesh: Mesh, wanted: tuple[bool, ...]) -> list[Float[Array, " _"]]:
     return [
-        jax.vmap(partial(scaled_jacobian, kind))(gather(mesh.points, nodes))
-        for (kind, nodes), needed in zip(mesh.blocks, wanted, strict=True)
+        jax.vmap(partial(scaled_jacobian, kind))(local_nodes(mesh.points, nodes, frames))
+        for (kind, nodes), frames, needed in zip(mesh.blocks, tangents(mesh), wanted, strict=True)
         if needed
     ]
 

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxsmooth.assembly import cut, each
+from jaxsmooth.assembly import cut, each, frames_of
 from jaxsmooth.cells.table import ElementType
 from jaxsmooth.convert.meshfile import as_mesh
 from jaxsmooth.mesh.execution import Execution
@@ -82,9 +82,14 @@ def as_metric(metric: Metric | str) -> Metric:
 
 @partial(jax.jit, static_argnames=("kind", "metric", "execution"))
 def _block_quality(
-    kind: ElementType, metric: Metric, execution: Execution, points: Array, nodes: Int[Array, "elements k"]
+    kind: ElementType,
+    metric: Metric,
+    execution: Execution,
+    points: Array,
+    nodes: Int[Array, "elements k"],
+    normals: Float[Array, "elements 3"] | None,
 ) -> Array:
-    chunks = cut(nodes, None, execution, _HEAVY)
+    chunks = cut(nodes, None, execution, _HEAVY, frames_of(kind, points, nodes, normals))
     mean = ()
     if metric.relative:
         seen = metric.sees(kind)
@@ -114,10 +119,10 @@ def quality(mesh: Any, metric: Metric | str = SHAPE) -> tuple[Float[Array, " _"]
             f"{', '.join(mesh.types) or 'no elements'}; choose another"
         )
     return tuple(
-        _block_quality(kind, metric, mesh.execution, mesh.points, nodes)
+        _block_quality(kind, metric, mesh.execution, mesh.points, nodes, up)
         if metric.applies_to(kind)
         else jnp.full(len(nodes), jnp.nan, mesh.points.dtype)
-        for kind, nodes in mesh.blocks
+        for (kind, nodes), up in zip(mesh.blocks, mesh.normals or (None,) * len(mesh.types), strict=True)
     )
 
 

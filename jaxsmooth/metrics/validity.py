@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsmooth.assembly import gather
+from jaxsmooth.assembly import local_nodes, tangents
 from jaxsmooth.cells.bernstein import Bernstein, bernstein
 from jaxsmooth.cells.table import ElementType
 from jaxsmooth.mesh.record import Mesh
@@ -113,8 +113,11 @@ def _volumes(tangents: Sequence[_Either]) -> _Either:
 
 
 @partial(jax.jit, static_argnames=("kind",))
-def _bounds(kind: ElementType, points: Array, nodes: Array) -> Array:
-    return jax.vmap(partial(determinant_bound, kind))(gather(points, nodes))
+def _bounds(kind: ElementType, points: Array, nodes: Array, frames: Array | None) -> Array:
+    return jax.vmap(partial(determinant_bound, kind))(local_nodes(points, nodes, frames))
+
+
+_tangents = jax.jit(tangents)
 
 
 def inverted(
@@ -134,13 +137,20 @@ def inverted(
         One mask ``[elements]`` for every block.
     """
     points = np.asarray(mesh.points, np.float64)
+    frames = _tangents(mesh.bare) if mesh.surface else (None,) * len(mesh.types)
     if bounds is None:
-        bounds = [_bounds(kind, mesh.points, nodes) for kind, nodes in mesh.blocks]
+        bounds = [
+            _bounds(kind, mesh.points, nodes, own)
+            for (kind, nodes), own in zip(mesh.blocks, frames, strict=True)
+        ]
     found = []
-    for (kind, nodes), bound in zip(mesh.blocks, bounds, strict=True):
+    for (kind, nodes), own, bound in zip(mesh.blocks, frames, bounds, strict=True):
         refuted = ~(np.asarray(bound) > 0)  # NaN is refuted below
         open_ = np.flatnonzero(refuted)
-        refuted[open_] = _refute(kind, points[np.asarray(nodes)[open_]])
+        places = points[np.asarray(nodes)[open_]]
+        if own is not None:
+            places = np.einsum("mkd,mjd->mkj", places, np.asarray(own, np.float64)[open_])
+        refuted[open_] = _refute(kind, places)
         found.append(refuted)
     return tuple(found)
 

@@ -12,7 +12,7 @@ from jaxsmooth.cells.table import ElementType, element_type
 from jaxsmooth.convert.meshfile import as_mesh
 from jaxsmooth.mesh.layers import layer_nodes, nodes_of, stretched
 from jaxsmooth.mesh.record import Labels, Mesh
-from jaxsmooth.mesh.topology import facet_keys, find_facets
+from jaxsmooth.mesh.topology import facet_keys, find_facets, kept_facets
 from jaxsmooth.metrics.summary import evaluated
 from jaxsmooth.motion.base import Motion
 from jaxsmooth.motion.coupled import couple
@@ -49,13 +49,16 @@ def detect_constraints(
 
     Nodes that belong together (`Labels.links`) move together.
 
+    A surface is kept as the boundary of a solid is: nodes slide within it, those of its borders, folds and
+    other edges along these.
+
     Curved faces are quadratic patches through the nodes, and quadratic facets as they are.
 
     Args:
         mesh: a `Mesh`, a `MeshFile`, or whatever else `as_mesh` takes.
         boundary: ``"planar"``, nodes slide on what is flat or straight, those of what is curved are held;
             ``"slide"``, they slide there too; or ``"fixed"`` to hold every boundary node.  By default
-            planar, or slide if `surfaces` are given.
+            planar, or slide if `surfaces` are given or the mesh is a surface.
         interfaces: the same choice for interfaces between regions.
         feature_angle: degrees.  A sharper fold, or bend of a curve, is an edge (a corner) of the shape; 50 by
             default.  With ``"planar"``: a straight fold that is shallower belongs to a curved face, whose
@@ -79,11 +82,11 @@ def detect_constraints(
     Raises:
         ValueError: for an unknown choice or set, a mask of another length, or a number out of range.
     """
-    usual = "slide" if surfaces else "planar"
-    boundary, interfaces = boundary or usual, interfaces or usual
-    _check(boundary, interfaces, layers, freeze_aspect, surface_tolerance)
     sets = getattr(mesh, "named_sets", {})
     mesh = as_mesh(mesh)
+    usual = "slide" if surfaces or mesh.surface else "planar"
+    boundary, interfaces = boundary or usual, interfaces or usual
+    _check(boundary, interfaces, layers, freeze_aspect, surface_tolerance)
     points = np.asarray(mesh.points, np.float64)
     count, dim = points.shape
     noise = Noise.of(np.asarray(mesh.points))
@@ -92,7 +95,7 @@ def detect_constraints(
     normals, tangents = Directions(count, dim, size), Directions(count, dim, size)
     functions = _functions(surfaces, sets, count)
 
-    all_facets = find_facets(mesh)
+    all_facets = kept_facets(mesh)
     if layers == "hold":
         held |= layer_nodes(mesh, all_facets)
     if freeze_aspect is not None:
@@ -113,6 +116,8 @@ def detect_constraints(
             one = chosen & ((facets.partner < 0) | (facets.region < facets.partner))  # of two sides
             regions = np.stack([facets.region[one], facets.partner[one]], axis=1)
             parts.append((facets.type, facets.nodes[one], regions))
+    if mesh.surface:
+        _add_rims(mesh, points, noise, flatness, tangents)
     if mesh.labels is not None:
         if mesh.labels.held is not None:
             held |= node_mask(mesh.labels.held, count)
@@ -211,6 +216,22 @@ def _tagged(
                 keys.append(facet_keys(nodes[:, : kind.corners], len(points)))
                 tags.append(tag)
     return surfaces, (np.concatenate(keys), np.concatenate(tags)), lines
+
+
+def _add_rims(
+    mesh: Mesh, points: np.ndarray, noise: Noise, flatness: float | None, tangents: Directions
+) -> None:
+    """Keep the edges of a surface that do not lie between two elements of one region."""
+    found = [(part.type, part.nodes, part.region) for part in find_facets(mesh)]
+    keys = facet_keys(np.concatenate([nodes[:, :2] for _, nodes, _ in found]), len(points))
+    regions = np.concatenate([region for *_, region in found])
+    _, same, number = np.unique(keys, return_inverse=True, return_counts=True)
+    rim = _on_border(keys, regions) | (number[same.reshape(-1)] > 2)
+    start = 0
+    for kind, nodes, _ in found:
+        segments = nodes[rim[start : start + len(nodes)]][:, kind.segments].reshape(-1, 2)
+        tangents.add(segments, unit_tangents(points[segments], noise.at(segments), flatness))
+        start += len(nodes)
 
 
 def _add_features(

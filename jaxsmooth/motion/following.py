@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from jaxsmooth.cells.table import ElementType, element_type
 from jaxsmooth.convert.meshfile import as_mesh
 from jaxsmooth.mesh.record import Mesh
-from jaxsmooth.mesh.topology import find_facets, node_pairs
+from jaxsmooth.mesh.topology import kept_facets, node_pairs
 from jaxsmooth.motion.base import Motion
 from jaxsmooth.motion.planar import Constraints
 from jaxsmooth.numerics.admissible import Admissible
@@ -151,7 +151,7 @@ def follow(mesh: Any, constraints: Motion) -> Following:
 def _facets(mesh: Mesh) -> tuple[tuple[ElementType, ...], tuple[Array, ...]]:
     """Facets on the boundary, between regions, and of tagged surfaces."""
     kinds, found = [], []
-    for part in find_facets(mesh):
+    for part in kept_facets(mesh):
         kept = (part.partner < 0) | (part.partner > part.region)
         kinds.append(part.type)
         found.append(jnp.asarray(part.nodes[kept], jnp.int32))

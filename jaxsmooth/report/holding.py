@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxsmooth.mesh.layers import layer_nodes
 from jaxsmooth.mesh.record import Mesh
-from jaxsmooth.mesh.topology import Facets, find_facets
+from jaxsmooth.mesh.topology import Facets, kept_facets
 from jaxsmooth.motion.base import Motion
 
 __all__ = ["REASONS", "Holding", "holding"]
@@ -54,7 +54,7 @@ class Holding:
 def holding(mesh: Mesh, motion: Motion, asked: np.ndarray | None = None) -> Holding:
     """The reasons of all nodes of a mesh at its points; an option holds those `asked` for ``[nodes]``."""
     admissible = motion.at(mesh.points)
-    freedom, facets = admissible.freedom, find_facets(mesh)
+    freedom, facets = admissible.freedom, kept_facets(mesh)
     dim, count = mesh.dim, len(mesh.points)
     reason = np.zeros(count, np.uint8)
     reason[freedom == dim - 1] = 1 if dim == 3 else 2

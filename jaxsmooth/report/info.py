@@ -106,14 +106,17 @@ def print_facts(out: Console, file: MeshFile, motion: Motion, held: Holding, row
     elements = ", ".join(f"{number:,} {name}" for name, number in row["elements"].items())
     others = {name: n for name, n in row["cells"].items() if name not in row["elements"]}
     low, high = row["bounds"]
+    flat = row["dim"] == 2 or file.mesh.surface
     table.add_row("format", str(row["format"]))
     table.add_row("nodes", f"{row['nodes']:,} in {len(low)}D")
-    table.add_row("elements", f"{elements}, {row['dim']}D")
+    table.add_row(
+        "elements", f"{elements}, {'surface in 3D' if file.mesh.surface else str(row['dim']) + 'D'}"
+    )
     if others:
         table.add_row("other cells", ", ".join(f"{number:,} {name}" for name, number in others.items()))
     table.add_row("from", ", ".join(f"{x:.6g}" for x in low))
     table.add_row("to", ", ".join(f"{x:.6g}" for x in high))
-    table.add_row("boundary", f"{row['boundary_facets']:,} {'sides' if row['dim'] == 2 else 'faces'}")
+    table.add_row("boundary", f"{row['boundary_facets']:,} {'sides' if flat else 'faces'}")
     turned = ", ".join(f"{number:,} {name}" for name, number in row["reversed"].items())
     table.add_row("orientation", f"{turned} the other way round" if turned else "as usual")
     table.add_row("linked", f"{row['linked_nodes']:,} nodes follow others")

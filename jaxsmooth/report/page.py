@@ -220,7 +220,7 @@ def _region_names(before: Mesh, result: SmoothResult) -> dict[int, str]:
     """Names of physical groups by their tags."""
     known = {} if result.file is None else result.file.source.field_data
     pairs = {name: np.ravel(entry) for name, entry in known.items() if np.size(entry) == 2}
-    return {int(tag): str(name) for name, (tag, dim) in pairs.items() if dim == before.dim}
+    return {int(tag): str(name) for name, (tag, dim) in pairs.items() if dim == before.element_dim}
 
 
 def _held(held: Holding) -> str:

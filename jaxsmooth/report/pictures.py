@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxsmooth.mesh.record import Mesh
-from jaxsmooth.mesh.topology import find_facets
+from jaxsmooth.mesh.topology import kept_facets
 from jaxsmooth.metrics.summary import evaluated
 
 try:
@@ -132,13 +132,16 @@ def _element_facets(
 
     groups: list[tuple[np.ndarray, np.ndarray]] = []
     if outer:
-        for facets in find_facets(mesh):
+        for facets in kept_facets(mesh):
             chosen = facets.nodes[facets.partner < 0][:, : facets.type.corners]
             groups.append((chosen, np.ones(len(chosen))))
     else:
         for (kind, nodes), q in zip(mesh.blocks, _quality(mesh), strict=True):
             q = np.asarray(q)
             chosen = np.asarray(nodes)[q < limit]
+            if kind.dim == 2:
+                groups.append((chosen[:, : kind.corners], q[q < limit]))
+                continue
             for group in kind.facets:
                 sides = chosen[:, group.nodes[:, : group.type.corners]]
                 groups.append((sides.reshape(-1, sides.shape[-1]), np.repeat(q[q < limit], sides.shape[1])))

@@ -256,4 +256,5 @@ def print_comparison(out: Console, before: Mesh, result: SmoothResult) -> None:
             )
             for m in (before, result.mesh)
         )
-        out.print(f"{'area' if before.dim == 2 else 'volume'} changed by {(last - first) / first:+.2e}")
+        what = "area" if before.element_dim == 2 else "volume"
+        out.print(f"{what} changed by {(last - first) / first:+.2e}")

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxsmooth.cells.table import ElementType
 from jaxsmooth.mesh.record import Mesh
-from jaxsmooth.mesh.topology import find_facets
+from jaxsmooth.mesh.topology import kept_facets
 from jaxsmooth.metrics.summary import evaluated
 from jaxsmooth.report.holding import REASONS, Holding
 
@@ -119,7 +119,7 @@ def _skin(mesh: Mesh, kept: list[np.ndarray]) -> list[tuple[dict[str, Any], np.n
             owner = np.repeat(np.arange(start, start + len(nodes)), len(group.nodes))
             sides.setdefault(group.type, []).append((owner, np.repeat(~mask, len(group.nodes))))
         start += len(nodes)
-    for part in find_facets(mesh):
+    for part in kept_facets(mesh):
         owner, absent = (np.concatenate(column) for column in zip(*sides[part.type], strict=True))
         chosen = absent & (part.partner < 0)
         if chosen.any() and part.type.dim == 2:

@@ -97,6 +97,8 @@ def stack(meshes: Sequence[Any], constraints: Sequence[Motion] | None = None) ->
     meshes = [as_mesh(mesh) for mesh in meshes]
     if not meshes or len({mesh.dim for mesh in meshes}) > 1:
         raise ValueError("stack needs meshes of one dimension, at least one")
+    if any(mesh.surface for mesh in meshes):
+        raise ValueError("stack takes no surfaces in space; smooth them one by one")
     if constraints is None:
         constraints = [detect_constraints(m, boundary="planar", interfaces="planar") for m in meshes]
     motions: list[Constraints] = []

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsmooth.assembly import Chunks, cut, scan
+from jaxsmooth.assembly import cut, local_nodes, scan, tangents
 from jaxsmooth.convert.meshfile import as_mesh
 from jaxsmooth.mesh.record import Mesh
 from jaxsmooth.methods import Elastic, Method
@@ -122,8 +122,9 @@ def filter_gradient(mesh: Any, gradient: Any, *, motion: Motion, radius: Float[A
     frame = Frame.of(mesh.points)
     mesh = mesh.with_points(frame.into(mesh.points))
     masses = jnp.zeros((len(gradient), 1), gradient.dtype)
-    for kind, nodes in mesh.blocks:
-        share = jax.vmap(lambda x, kind=kind: measure(kind, x))(mesh.points[nodes]) / kind.k
+    for (kind, nodes), frames in zip(mesh.blocks, tangents(mesh), strict=True):
+        local = local_nodes(mesh.points, nodes, frames)
+        share = jax.vmap(lambda x, kind=kind: measure(kind, x))(local) / kind.k
         masses = masses.at[nodes].add(share[:, None, None])
     square = jnp.asarray((radius * frame.scale) ** 2, gradient.dtype)
     operator = _Filter(masses, square, _operator(mesh))
@@ -131,19 +132,19 @@ def filter_gradient(mesh: Any, gradient: Any, *, motion: Motion, radius: Float[A
     blocks = blocks + square * operator.stiffness.diagonal(len(gradient))
     admissible = motion.within(frame).at(mesh.points)
     found = solve_projected(operator, blocks, admissible, gradient, gradient_tolerance(gradient.dtype), _MOST)
-    return found.field * frame.scale**mesh.dim
+    return found.field * frame.scale**mesh.element_dim
 
 
 def _operator(mesh: Mesh) -> Operator:
     """The stiffness of the elements as they are."""
     blocks = []
-    for kind, nodes in mesh.blocks:
+    for (kind, nodes), frames in zip(mesh.blocks, tangents(mesh), strict=True):
 
         def visit(carry, chunk, kind=kind):
             found = jax.vmap(lambda x: linearise(kind, x, jnp.abs(measure(kind, x))))(chunk.local)
             return carry, found
 
-        chunks = cut(nodes, None, mesh.execution)
+        chunks = cut(nodes, None, mesh.execution, frames=frames)
         _, elements = scan(visit, None, chunks, mesh.points)
-        blocks.append(Chunks(chunks.nodes, elements, chunks.count))
+        blocks.append(chunks.holding(elements))
     return Operator(tuple(blocks), Material())

@@ -40,7 +40,7 @@ def _format(
 
 
 def _surfaces(name: str, *suffixes: str) -> Format:
-    refusal = f"{name} files hold surfaces only; write .vtu, .msh or .xdmf instead"
+    refusal = f"{name} files are read only; write .vtu, .msh or .xdmf instead"
     return _format(name, *suffixes, refusal=refusal)
 
 
@@ -64,10 +64,6 @@ RARE = (
     _format("tecplot", ".dat", ".tec", text=True),
     _format("tetgen", ".ele", ".node", types=frozenset({"tetra"})),
     _surfaces("neuroglancer"),
-    _surfaces("obj", ".obj"),
-    _surfaces("off", ".off"),
-    _surfaces("ply", ".ply"),
-    _surfaces("stl", ".stl"),
     _surfaces("svg", ".svg"),
     _surfaces("wkt", ".wkt"),
 )

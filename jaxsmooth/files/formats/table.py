@@ -26,6 +26,7 @@ from jaxsmooth.files.formats.npz import NPZ
 from jaxsmooth.files.formats.rare import RARE
 from jaxsmooth.files.formats.record import Format, stem_format
 from jaxsmooth.files.formats.su2 import SU2
+from jaxsmooth.files.formats.surfaces import SURFACES
 from jaxsmooth.files.formats.ugrid import UGRID
 from jaxsmooth.files.formats.unv import UNV
 from jaxsmooth.files.formats.vtk import VTK, VTK42
@@ -50,6 +51,7 @@ def register(format: Format) -> None:
 
 for _format in (
     *(GMSH22, GMSH, VTU, VTK, VTK42, XDMF, ABAQUS, MEDIT, SU2, EXODUS, MED, NASTRAN, UNV, UGRID, NPZ),
+    *SURFACES,
     *RARE,
 ):
     register(_format)

@@ -105,7 +105,8 @@ class Operator(eqx.Module):
 
     def diagonal(self, count: int) -> Float[Array, "nodes dim dim"]:
         """Diagonal blocks of K at each of `count` nodes."""
-        dim = self.blocks[0].data.gradients.shape[-1]
+        first = self.blocks[0]
+        dim = (first.data.gradients if first.frames is None else first.frames).shape[-1]
         total = jnp.zeros((count, dim, dim), self.blocks[0].data.gradients.dtype)
         for block in self.blocks:
             total = sum_to_nodes(lambda element, _: node_blocks(element, self.material), block, None, total)

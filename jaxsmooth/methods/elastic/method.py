@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsmooth.assembly import Chunks, cut, each, gather, mapped, scan
+from jaxsmooth.assembly import cut, each, local_nodes, mapped, scan, tangents
 from jaxsmooth.guards.acceptance import AcceptanceRule
 from jaxsmooth.guards.base import Guard
 from jaxsmooth.guards.patch import PatchGuard
@@ -75,10 +75,11 @@ class Elastic(Method):
         mesh, motion = mesh.with_points(frame.into(mesh.points)), motion.within(frame)
         count = len(mesh.points)
         sizes = self.target.measures(mesh, frame)
-        rotations = _rotations(mesh)
+        frames = tangents(mesh)
+        rotations = _rotations(mesh, frames)
         weights = self.priorities(mesh) if self.extended else tuple(jnp.ones_like(part) for part in sizes)
         force, blocks = jnp.zeros_like(mesh.points), []
-        for (kind, nodes), *data in zip(mesh.blocks, sizes, rotations, weights, strict=True):
+        for (kind, nodes), own, *data in zip(mesh.blocks, frames, sizes, rotations, weights, strict=True):
 
             def pull(element, nodes, kind=kind):
                 size, turn, weight = element
@@ -91,9 +92,9 @@ class Elastic(Method):
                 forces, elements = jax.vmap(pull)(chunk.data, chunk.local)
                 return chunk.add(total, forces), elements
 
-            chunks = cut(nodes, tuple(data), mesh.execution)
+            chunks = cut(nodes, tuple(data), mesh.execution, frames=own)
             force, elements = scan(add, force, chunks, mesh.points)
-            blocks.append(Chunks(chunks.nodes, elements, chunks.count))
+            blocks.append(chunks.holding(elements))
         operator = Operator(tuple(blocks), self.material)
         found = solve_projected(
             operator,
@@ -111,19 +112,24 @@ class Elastic(Method):
         def quality(kind, nodes):
             return shape_quality(kind, nodes, self.beta)
 
-        q = tuple(jax.vmap(partial(quality, kind))(gather(mesh.points, nodes)) for kind, nodes in mesh.blocks)
+        q = tuple(
+            jax.vmap(partial(quality, kind))(local_nodes(mesh.points, nodes, frames))
+            for (kind, nodes), frames in zip(mesh.blocks, tangents(mesh), strict=True)
+        )
         gap = 1 - least(jnp.concatenate(q))
         perfect = gap <= 0
         return tuple(jnp.where(perfect, 0, (1 - part) / jnp.where(perfect, 1, gap)) for part in q)
 
 
-def _rotations(mesh: Mesh) -> list[Float[Array, "_ dim dim"]]:
+def _rotations(
+    mesh: Mesh, frames: tuple[Float[Array, "_ 2 3"] | None, ...]
+) -> list[Float[Array, "_ dim dim"]]:
     """Of the fitted ideal elements (Eq. 14, corrected); all blocks together, for it is a large program."""
     found = []
-    for kind, nodes in mesh.blocks:
+    for (kind, nodes), own in zip(mesh.blocks, frames, strict=True):
         ideal = jnp.asarray(kind.ideal, mesh.points.dtype)
         function = partial(lambda ideal, _, local: moments(ideal, local), ideal)
-        found.append(each(function, cut(nodes, None, mesh.execution), mesh.points))
+        found.append(each(function, cut(nodes, None, mesh.execution, frames=own), mesh.points))
     turned = mapped(rotation, jnp.concatenate(found), mesh.execution)
     ends = np.cumsum([len(part) for part in found])[:-1]
     return jnp.split(turned, ends)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsmooth.assembly import Chunk, Chunks, cut, gather, scan, sum_to_nodes
+from jaxsmooth.assembly import Chunk, Chunks, cut, gather, scan, sum_to_nodes, tangents
 from jaxsmooth.cells.table import ElementType
 from jaxsmooth.mesh.execution import Execution
 from jaxsmooth.mesh.record import Mesh
@@ -135,7 +135,7 @@ class Problem(eqx.Module):
         for kind, block in zip(self.kinds, self.blocks, strict=True):
             function = partial(inverse_quality, kind, self.metric, self.size_weight)
             batch = jax.vmap(jax.vmap(function, in_axes=(0, 0, None)), in_axes=(0, 0, None))
-            corners = _whole(kind, block.data.weight, gather(points, block.nodes))
+            corners = _whole(kind, block.data.weight, block.local_nodes(points))
             found.append((batch(corners, block.data.size, jnp.zeros((), points.dtype))[0], block.data.weight))
         e, weight = (
             jnp.concatenate([part.reshape(-1) for part in side]) for side in zip(*found, strict=True)
@@ -146,7 +146,7 @@ class Problem(eqx.Module):
         """The least determinant of every element over its target's; ∞ for those without weight."""
 
         def found(kind, block):
-            corners = _whole(kind, block.data.weight, gather(points, block.nodes))
+            corners = _whole(kind, block.data.weight, block.local_nodes(points))
             det = jax.vmap(jax.vmap(partial(_least_determinant, kind)))(corners) / block.data.size
             return jnp.where(block.data.weight > 0, det, jnp.inf)
 
@@ -170,7 +170,7 @@ class Problem(eqx.Module):
             reference = jnp.asarray(kind.validity_gradients, points.dtype)
             depends = np.abs(kind.validity_gradients).max(axis=-1) > 1e-12  # zero but for rounding
             held = ~(depends & gather(free, block.nodes)[..., None, :]).any(axis=-1)
-            corners = _whole(kind, block.data.weight, gather(points, block.nodes))
+            corners = _whole(kind, block.data.weight, block.local_nodes(points))
             det = jax.vmap(jax.vmap(lambda nodes: determinant(contract(nodes, reference))))(corners)
             return (held & ~(det > 0)).any(axis=-1)
 
@@ -255,7 +255,7 @@ class Problem(eqx.Module):
                 return state, model
 
             state, model = scan(add, state, block, points)
-            models.append(Chunks(block.nodes, model, block.count))
+            models.append(block.holding(model))
         value, gradient, blocks = state
         return Quadratic(value, gradient, tuple(models), blocks)
 
@@ -317,12 +317,12 @@ def problem(
     counted = [gather(free, nodes).any(axis=1).astype(dtype) for _, nodes in mesh.blocks]
     total = jnp.concatenate(counted).sum()
     blocks = tuple(
-        _cut(nodes, size, part / jnp.where(total > 0, total, 1), mesh.execution)
-        for (_, nodes), size, part in zip(mesh.blocks, sizes, counted, strict=True)
+        _cut(nodes, size, part / jnp.where(total > 0, total, 1), mesh.execution, frames)
+        for (_, nodes), frames, size, part in zip(mesh.blocks, tangents(mesh), sizes, counted, strict=True)
     )
     return Problem(motion, blocks, aggregation, jnp.asarray(size_weight, dtype), kinds, metric)
 
 
-def _cut(nodes: Array, size: Array, weight: Array, execution: Execution) -> Chunks:
-    chunks = cut(nodes, Weighted(size, weight, jnp.zeros_like(size)), execution, _HEAVY)
+def _cut(nodes: Array, size: Array, weight: Array, execution: Execution, frames: Array | None) -> Chunks:
+    chunks = cut(nodes, Weighted(size, weight, jnp.zeros_like(size)), execution, _HEAVY, frames)
     return eqx.tree_at(lambda c: c.data.weight, chunks, jnp.where(chunks.real, chunks.data.weight, 0))
