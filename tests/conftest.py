@@ -21,6 +21,7 @@ if "PYTEST_XDIST_WORKER" not in os.environ:  # workers have these from the proce
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
     os.environ["JAXSMOOTH_CACHE"] = "off"
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # it reports kept programs as errors
 
 import jax
 import pytest

@@ -8,9 +8,8 @@ from jaxtyping import Array, Float
 
 __all__ = ["STEEP", "flattened", "lifted", "tangent_frame"]
 
-STEEP = (
-    0.5  # cosine of the angle at which an element is looked at along the reference, not along its own normal
-)
+STEEP = 0.5
+"""Cosine of the angle from which on an element is looked at along the reference, not along its own normal."""
 
 
 def tangent_frame(corners: Float[Array, "c 3"], reference: Float[Array, "3"]) -> Float[Array, "2 3"]:
