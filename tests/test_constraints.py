@@ -3,7 +3,6 @@
 import meshes
 import numpy as np
 import pytest
-from damage import Damage, damaged
 
 from jaxsmooth.mesh.record import Labels, Mesh
 from jaxsmooth.motion.detect import detect_constraints
@@ -41,26 +40,6 @@ def test_box_turned_and_sheared(name):
 def test_counts_of_a_cube():
     found = detect_constraints(Mesh(*meshes.grid("tetra"))).freedom
     np.testing.assert_array_equal(np.bincount(found), [8, 12, 6, 1])
-
-
-def test_a_facet_without_height_holds_its_nodes_at_any_size():
-    """In the largest mesh its angle to the others is past what numbers can tell."""
-    points, blocks = meshes.grid("tetra")
-    side = points[:, 0] == 0
-    middle = np.flatnonzero(side & (points[:, 1:] == 0.5).all(axis=1))[0]
-    points[middle] = 0  # onto a corner of the cube
-    for size in (1.0, 1e17):
-        free = detect_constraints(Mesh(size * points, blocks)).freedom
-        assert free[middle] == 0
-        assert free.max() == 3
-
-
-def test_nodes_among_tiny_facets_slide_in_the_plane_of_the_large_ones():
-    """A graded and turned side, 1000 times as long as wide: tiny facets have normals off by 1e-8."""
-    case = damaged("tetra10", Damage(jiggle=0.8, grading=4.0, stretch=1e3, turned=True, seed=124))
-    free = np.asarray(detect_constraints(case.mesh).projectors)
-    for nodes, normal, _ in case.planes:
-        assert np.abs(free[nodes] @ normal).max() < 1e-12
 
 
 def test_polygon_with_a_reentrant_corner():

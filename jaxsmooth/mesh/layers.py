@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxsmooth.cells.table import ElementType
 from jaxsmooth.mesh.record import Mesh
-from jaxsmooth.mesh.topology import Facets, at_nodes, determinants, facet_keys, find_facets, frames_of
+from jaxsmooth.mesh.topology import Facets, at_nodes, deformations, determinants, facet_keys, find_facets
 
 __all__ = ["STRETCHED", "aspect_ratios", "boundary_layers", "layer_nodes", "nodes_of", "stretched"]
 
@@ -50,7 +50,7 @@ def _stretched(kind: ElementType, points: np.ndarray, nodes: np.ndarray, beyond:
     det A over the mean square of A's singular values to the power of dim/2 is 1 for a cube; stretched
     by r it is at most what it is for (r, m, 1) with m² = (r² + 1)/2, in the plane for (r, 1)."""
     corners = at_nodes(np.asarray(points, np.float64), nodes)
-    frames = frames_of(corners, np.tensordot(kind.weights, kind.gradients, 1)[None])
+    frames = deformations(corners, np.tensordot(kind.weights, kind.gradients, 1)[None])
     square = (frames * frames).sum(axis=(0, 1, 2)) / kind.dim
     if kind.dim == 2:
         most = 2 * beyond / (beyond**2 + 1)

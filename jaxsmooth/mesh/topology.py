@@ -17,10 +17,10 @@ from jaxsmooth.mesh.record import Mesh
 __all__ = [
     "Facets",
     "at_nodes",
+    "deformations",
     "determinants",
     "facet_keys",
     "find_facets",
-    "frames_of",
     "kept_facets",
     "lengths",
     "node_pairs",
@@ -179,7 +179,7 @@ def at_nodes(points: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.asarray(points).T)[:, np.asarray(nodes).T]
 
 
-def frames_of(corners: np.ndarray, gradients: np.ndarray) -> np.ndarray:
+def deformations(corners: np.ndarray, gradients: np.ndarray) -> np.ndarray:
     """Deformation gradients ``[q, dim, dim, elements]`` of elements ``[dim, k, elements]``, on the host.
 
     Those of natural derivatives ``[q, k, dim]``, of which most are zero for linear elements.
@@ -206,4 +206,4 @@ def signed_measures(kind: ElementType, points: np.ndarray, nodes: np.ndarray) ->
     if not len(nodes):
         return np.zeros(0)
     corners = at_nodes(np.asarray(points, np.float64), nodes)
-    return kind.weights @ determinants(frames_of(corners, kind.gradients))
+    return kind.weights @ determinants(deformations(corners, kind.gradients))
