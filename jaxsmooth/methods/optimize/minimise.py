@@ -81,8 +81,8 @@ class Newton(Minimiser):
             ).field
             slope = jnp.vdot(gradient, move)
 
-            def place(length):
-                return problem.motion.retract(points, here.followed(length * move))
+            def place(length):  # projected again: what cancels in a sum of long moves leaves rounding
+                return problem.motion.retract(points, here.expand(length * move))
 
             def rejected(trial):
                 length, after, least, halvings = trial
