@@ -192,14 +192,16 @@ def patch_medit(
         start = next(start for key, start in _binary_sections(content) if key == _BINARY_VERTICES)
         row = width * real.itemsize + number.itemsize
         first = start + number.itemsize + row * np.arange(len(old))[:, None]
-        return Patched(put_binary(content, first + real.itemsize * np.arange(width), real, old, new))
+        return Patched(
+            put_binary(content, first + real.itemsize * np.arange(width), real, old, new), proven=True
+        )
     plain = blanked(content, b"#")
     head = re.search(rb"(?<![\w.])Vertices\s+(\d+)", plain)
     if head is None:
         raise UnpatchableError("it has no section Vertices")
     starts, ends = tokens(plain, head.end(), _next_word(plain, head.end()))
     row = (width + 1) * np.arange(int(head[1]))[:, None] + np.arange(width)
-    return Patched(put_text(content, Places(starts[row], ends[row]), old, new))
+    return Patched(put_text(content, Places(starts[row], ends[row]), old, new), proven=True)
 
 
 def _next_word(content: bytes, start: int) -> int:

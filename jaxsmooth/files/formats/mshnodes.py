@@ -56,7 +56,7 @@ def patch_msh(
     parametric = np.concatenate([np.full(len(b.rest), b.parametric) for b in blocks] or [np.zeros(0, bool)])
     stale = int((parametric & (old != new).any(axis=1)).sum())
     told = f"the parametric coordinates of {stale} nodes that move are kept as they are in the file"
-    return Patched(content, (told,) if stale else ())
+    return Patched(content, (told,) if stale else (), proven=True)
 
 
 def without_parameters(content: bytes) -> bytes:

@@ -61,10 +61,24 @@ _CUT = "the file is damaged or cut short"
 
 def section_span(content: bytes, name: str) -> tuple[int, int]:
     """First byte of what stands in a section, and the byte behind the last; `ValueError` without it."""
-    found = re.search(rb"^\$%s[ \t]*\r?\n" % name.encode(), content, re.M)
-    if found is None:
-        raise ValueError(f"it has no section ${name}")
-    return found.end(), content.find(b"$End" + name.encode(), found.end())
+    begin = b"$" + name.encode()
+    head, at = re.compile(rb"[ \t]*\r?\n"), content.find(begin)
+    while at >= 0:  # faster than a pattern for the whole line, and content may be binary
+        found = head.match(content, at + len(begin))
+        if found is not None and (at == 0 or content[at - 1 : at] == b"\n"):
+            return found.end(), content.find(b"$End" + name.encode(), found.end())
+        at = content.find(begin, at + 1)
+    raise ValueError(f"it has no section ${name}")
+
+
+def _begins(content: bytes) -> Iterator[bytes]:
+    """Names of the sections that begin."""
+    head, at = re.compile(rb"\$(?!End)(\w+)[ \t]*(?:\r?\n|$)"), content.find(b"$")
+    while at >= 0:
+        found = head.match(content, at)
+        if found is not None and (at == 0 or content[at - 1 : at] == b"\n"):
+            yield found[1]
+        at = content.find(b"$", at + 1)
 
 
 def msh_format(content: bytes) -> tuple[str, bool, int] | None:
@@ -83,7 +97,7 @@ def check_msh(content: bytes) -> None:
     if (found := msh_format(content)) is None:
         return
     version, binary, size = found
-    for name in re.findall(rb"^\$(?!End)(\w+)[ \t]*\r?$", content, re.MULTILINE):
+    for name in _begins(content):
         if content.count(b"$End" + name) < 1:
             raise ValueError(f"its section ${name.decode()} has no end; {_CUT}")
     if not re.search(rb"\$End\w+\s*$", content[-4096:]):
@@ -213,7 +227,7 @@ def read_entities(content: bytes) -> list[Entity]:
     return [
         entity
         for name in ("Entities", "PartitionedEntities")
-        if re.search(rb"^\$%s\b" % name.encode(), content, re.M)
+        if b"$" + name.encode() in content
         for entity in _entities(Section(content, name, binary, size), version)
     ]
 

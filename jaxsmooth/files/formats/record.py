@@ -46,6 +46,8 @@ class Patched:
         inputs: files beside the source that must not be replaced.
         refers: files, relative to the folder of the source, that the result names and that stay there.
         precision: to which the file holds coordinates, of the largest of them.
+        proven: only bytes of coordinates are others, and stood where the old ones were found; others are
+            read again before they count.
     """
 
     content: bytes
@@ -54,6 +56,7 @@ class Patched:
     inputs: tuple[Path, ...] = ()
     refers: tuple[str, ...] = ()
     precision: float = 1e-12
+    proven: bool = False
 
 
 Patch = Callable[[Source, Float[np.ndarray, "nodes dim"], Float[np.ndarray, "nodes dim"]], Patched]

@@ -247,7 +247,7 @@ def patch_su2(
         raise UnpatchableError("the lines of its nodes don't have equally many numbers")
     columns = slice(0, old.shape[1])
     places = Places(starts.reshape(count, -1)[:, columns], ends.reshape(count, -1)[:, columns])
-    return Patched(put_text(source.content, places, old, new))
+    return Patched(put_text(source.content, places, old, new), proven=True)
 
 
 SU2 = Format(

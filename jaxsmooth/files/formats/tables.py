@@ -34,6 +34,6 @@ def patch_table(head: bytes, lead: int, width: int = 3, comment: bytes = b"#") -
         row = (lead + width) * np.arange(int(found[1]))[:, None] + lead + np.arange(width)
         if row.size and row.max() >= len(starts):
             raise UnpatchableError("its nodes end early")
-        return Patched(put_text(source.content, Places(starts[row], ends[row]), old, new))
+        return Patched(put_text(source.content, Places(starts[row], ends[row]), old, new), proven=True)
 
     return patch

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from jaxsmooth.convert.checks import check_last_line
 from jaxsmooth.files.formats.meshios import read_copy
 from jaxsmooth.files.formats.record import Format, Holds, Patched, Source, UnpatchableError
-from jaxsmooth.files.formats.vtktext import lines_like, with_sizes, without_text
+from jaxsmooth.files.formats.vtktext import lines_with, with_sizes, without_text
 from jaxsmooth.files.numbers import Places, put_binary, put_text, tokens
 from jaxsmooth.files.reduction import UNKEPT
 
@@ -49,7 +49,7 @@ def check_vtk(content: bytes, mesh: meshio.Mesh) -> None:
     said = _counts(capitals, "CELLS")
     if len(said) < 2 or any(block.type.startswith("poly") for block in mesh.cells):
         return
-    newer = bool(lines_like(re.compile(rb"OFFSETS\s"), content, (b"OFFSETS",)))
+    newer = any(lines_with(re.compile(rb"OFFSETS\s"), content, b"OFFSETS"))
     numbers = sum(block.data.size for block in mesh.cells)
     if said[1] != numbers + (0 if newer else cells):
         raise ValueError(f"its section CELLS has other numbers of nodes than its CELL_TYPES want; {_CUT}")
@@ -57,8 +57,8 @@ def check_vtk(content: bytes, mesh: meshio.Mesh) -> None:
 
 def _counts(content: bytes, key: str) -> list[int]:
     pattern = re.compile(rb"[ \t]*" + key.encode() + rb"[ \t]+(\d+)(?:[ \t]+(\d+))?")
-    found = lines_like(pattern, content, (key.encode(),))
-    return [int(word) for word in found[0].groups() if word] if found else []
+    found = next(lines_with(pattern, content, key.encode()), None)
+    return [] if found is None else [int(word) for word in found.groups() if word]
 
 
 def pad_pairs(mesh: meshio.Mesh) -> None:
@@ -101,7 +101,7 @@ def patch_vtk(
         if len(starts) < index.size:
             raise UnpatchableError("its section POINTS ends early")
         content = put_text(content, Places(starts[index], ends[index]), old, new)
-    return Patched(content)
+    return Patched(content, proven=True)
 
 
 def _sniff(head: bytes) -> tuple[int, str]:
