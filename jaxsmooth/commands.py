@@ -164,12 +164,17 @@ def _smooth_several(options: argparse.Namespace, outputs: Outputs) -> int:
     return INVERTED if tangled else DONE
 
 
+def _settings(options: argparse.Namespace, source: str | Path) -> dict[str, Any]:
+    """The input, and the options that say what is done, by name."""
+    left_out = ("command", "files", "out_dir", "json", "report", "quiet", "force", "precision", "no_cache")
+    shown = {name.replace("_", " "): v for name, v in vars(options).items() if name not in left_out}
+    return {"input": source, **{name: v for name, v in shown.items() if name != "input"}}
+
+
 def _write_report(outputs: Outputs, options: argparse.Namespace, source: Path, done: _Done) -> None:
     from jaxsmooth.report.page import html_page
 
-    left_out = ("command", "files", "out_dir", "json", "report", "quiet", "force", "precision", "no_cache")
-    settings = {"input": source, "output": options.files[1]}
-    settings |= {name.replace("_", " "): v for name, v in vars(options).items() if name not in left_out}
+    settings = _settings(options, source) | {"output": options.files[1]}
     more = {"settings": settings, "seconds": done.row["seconds"], "notes": done.file.notes}
     outputs.text(options.report, html_page(source.name, done.file.mesh, done.result, **more))
 
@@ -244,6 +249,7 @@ def compare(options: argparse.Namespace, outputs: Outputs) -> int:
     rows = [compared.compare_row("input", file.mesh, None, constraints, {})]
     compared.print_head(out)
     compared.print_row(out, rows[0])
+    results = {}
     columns = SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
     with Progress(*columns, console=out, transient=True, disable=not out.is_terminal) as progress:
         task = progress.add_task("", total=None)
@@ -252,6 +258,7 @@ def compare(options: argparse.Namespace, outputs: Outputs) -> int:
             clock = report.Clock()
             with clock("smooth"):
                 result = choices.run_method(file, method, options.steps, constraints, None)
+            results[name] = result
             rows.append(compared.compare_row(name, file.mesh, result, constraints, clock.split()))
             compared.print_row(out, rows[-1])
     compared.print_movable(out, rows)
@@ -261,6 +268,14 @@ def compare(options: argparse.Namespace, outputs: Outputs) -> int:
         content = {"input": options.input, **report.counts(file.mesh), "methods": rows, "notes": file.notes}
         content |= {"best": best, "advice": words}
         _write_json(outputs, options.json, content)
+    if options.report is not None:
+        from jaxsmooth.report.page import html_comparison
+
+        more = {"settings": _settings(options, options.input), "notes": file.notes}
+        outputs.text(
+            options.report, html_comparison(Path(options.input).name, file.mesh, results, rows, **more)
+        )
+    if options.json or options.report:
         _finish(out, outputs, "wrote {}")
     return DONE
 

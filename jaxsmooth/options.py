@@ -111,6 +111,8 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("input", metavar="IN", help="mesh file; it is only read")
     help = f"some of {METHODS} (default: all)"
     command.add_argument("--methods", default=None, metavar="A,B,…", help=help)
+    help = "write a page for any browser with the meshes of all methods, two at a time (default: none)"
+    command.add_argument("--report", metavar="FILE.html", help=help)
     _add_run_options(command)
     command.set_defaults(command="compare")
 

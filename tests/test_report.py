@@ -18,7 +18,8 @@ import jaxsmooth as js
 from jaxsmooth.mesh.topology import find_facets
 from jaxsmooth.report import scene as scenes
 from jaxsmooth.report.holding import REASONS, holding
-from jaxsmooth.report.page import html_page
+from jaxsmooth.report.compared import compare_row
+from jaxsmooth.report.page import html_comparison, html_page
 from jaxsmooth.report.scene import scene
 
 
@@ -87,8 +88,8 @@ def test_curved_boundaries_marks_regions_and_links():
 @pytest.mark.parametrize("kind", ["tetra10", "hexahedron", "quad8", "wedge15"])
 def test_the_scene_is_the_mesh(kind):
     mesh = box(kind, (2, 2, 2)[: meshes.dim_of(kind)], 0.05)
-    drawn = scene(mesh, mesh, holding(mesh, js.detect_constraints(mesh)))
-    places = numbers(drawn["before"], "<f4").reshape(-1, 3)[:, : mesh.dim]
+    drawn = scene({"before": mesh, "after": mesh}, holding(mesh, js.detect_constraints(mesh)))
+    places = numbers(drawn["states"][0]["points"], "<f4").reshape(-1, 3)[:, : mesh.dim]
     np.testing.assert_allclose(places, mesh.points, atol=1e-6)
     (block,) = drawn["blocks"]
     nodes = numbers(block["nodes"], "<u2").reshape(block["count"], block["k"])
@@ -100,14 +101,14 @@ def test_the_scene_is_the_mesh(kind):
         assert kf == {len(part.type.outline) for part in find_facets(mesh)}
     else:
         assert sides == {frozenset(row) for row in np.asarray(mesh.connectivity[0])}
-    q = numbers(drawn["quality"][0], "<i2") / 32000
+    q = numbers(drawn["states"][0]["quality"], "<i2") / 32000
     np.testing.assert_allclose(q, js.quality(mesh)[0], atol=2e-5)
 
 
 def test_of_large_meshes_the_boundary_and_the_poorest_elements(monkeypatch):
     mesh = box(shape=(4, 4, 4))
     monkeypatch.setattr(scenes, "_BUDGET", 800)
-    drawn = scene(mesh, mesh, holding(mesh, js.detect_constraints(mesh)))
+    drawn = scene({"before": mesh, "after": mesh}, holding(mesh, js.detect_constraints(mesh)))
     full, *skins = drawn["blocks"]
     assert full["count"] == 50
     q = np.asarray(js.quality(mesh)[0])
@@ -116,7 +117,7 @@ def test_of_large_meshes_the_boundary_and_the_poorest_elements(monkeypatch):
     own = np.isin(np.repeat(np.arange(len(q)), 4), drawn["ids"])
     left = sum(int(((part.partner < 0) & ~own).sum()) for part in find_facets(mesh))
     assert sum(block["count"] for block in skins) == left < outer
-    assert len(numbers(drawn["quality"][1], "<i2")) == 50 + left
+    assert len(numbers(drawn["states"][1]["quality"], "<i2")) == 50 + left
 
 
 def test_the_page_says_what_was_done_and_asks_for_nothing():
@@ -188,9 +189,9 @@ document.body.dataset.said = JSON.stringify(said);
 </script>"""
 
 
-def in_a_browser(page, folder, width=900):
+def in_a_browser(page, folder, width=900, script=SCRIPT):
     path = folder / "report.html"
-    path.write_text(page.replace("</body>", SCRIPT + "</body>"), encoding="utf-8")
+    path.write_text(page.replace("</body>", script + "</body>"), encoding="utf-8")
     flags = (
         "--headless --no-sandbox --disable-gpu-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader"
     )
@@ -227,3 +228,56 @@ def test_sliders_and_clicks_change_what_is_shown(kind, width, tmp_path):
     assert said["picked"] == f"{kind} {worst}: q {q[0][worst]:.3f} → {q[1][worst]:.3f}"
     assert said["requests"] == 0
     assert said["error"] == 0
+
+
+SIDES_SCRIPT = """<script>
+const said = {sides: [nameOf("before"), nameOf("after")], names: mesh.states.map((s) => s.name)};
+const picture = () => { paint(); return canvas.toDataURL(); };
+document.querySelector('[data-group=view] button[value="after"]').click();
+const still = picture();
+const select = $("tag-after").querySelector("select");
+select.value = 0;
+select.dispatchEvent(new Event("change"));
+said.changed = still !== picture();
+said.now = $("only-after").textContent;
+said.q = Array.from(mesh.quality.after.slice(0, 3));
+said.requests = performance.getEntriesByType("resource").length;
+said.error = gl.getError();
+document.body.dataset.said = JSON.stringify(said);
+</script>"""
+
+
+def compared(mesh):
+    methods = {"elastic": js.Elastic(), "smart": js.Laplacian(smart=True)}
+    results = {name: js.smooth(mesh, method, steps=1) for name, method in methods.items()}
+    constraints = js.detect_constraints(mesh)
+    rows = [compare_row("input", mesh, None, constraints, {})]
+    rows += [compare_row(name, mesh, r, constraints, {"smooth": 1.0}) for name, r in results.items()]
+    return results, html_comparison("two <methods>", mesh, results, rows, notes=["odd"])
+
+
+def test_a_comparison_has_all_methods_and_what_each_made():
+    mesh = box()
+    results, page = compared(mesh)
+    drawn = scene_of(page)
+    assert [state["name"] for state in drawn["states"]] == ["input", "elastic", "smart"]
+    for state, result in zip(drawn["states"][1:], results.values(), strict=True):
+        places = numbers(state["points"], "<f4").reshape(-1, 3)
+        np.testing.assert_allclose(places, result.mesh.points, atol=1e-6)
+    assert drawn["states"][drawn["right"]]["name"] == "smart"
+    text = html.unescape(re.sub(r"<[^>]+>", " ", page.split('<script id="scene"')[0]))
+    for words in ("two <methods>", "Take smart", "q_avg", "odd", "held: edge or corner"):
+        assert words in text
+    assert f"{results['smart'].history[-1].statistics.q_avg:.4g}" in text
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")
+def test_any_two_methods_stand_side_by_side(tmp_path):
+    mesh = box()
+    said = in_a_browser(compared(mesh)[1], tmp_path, script=SIDES_SCRIPT)
+    assert said["sides"] == ["input", "smart"]
+    assert said["names"] == ["input", "elastic", "smart"]
+    assert said["changed"]
+    assert said["now"] == "input"
+    np.testing.assert_allclose(np.array(said["q"]) / 32000, js.quality(mesh)[0][:3], atol=2e-5)
+    assert said["requests"] == said["error"] == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from textwrap import wrap
 from typing import Any
 
@@ -14,7 +15,15 @@ from jaxsmooth.motion.base import Motion
 from jaxsmooth.report.report import finite, movable_elements, summarise
 from jaxsmooth.runs.driver import SmoothResult
 
-__all__ = ["compare_row", "print_advice", "print_head", "print_movable", "print_row", "recommend"]
+__all__ = [
+    "columns",
+    "compare_row",
+    "print_advice",
+    "print_head",
+    "print_movable",
+    "print_row",
+    "recommend",
+]
 
 _CLOSE = 1e-3  # of the average quality: what nobody sees in a solution
 _CHEAP = 0.5  # part of the time of the best method, below which a quicker one is worth a word
@@ -100,14 +109,14 @@ def _cheaper(best: dict[str, Any], better: list[dict[str, Any]]) -> list[str]:
     ]
 
 
-# --- Console ---------------------------------------------------------------------------
+# --- Tables ----------------------------------------------------------------------------
 
 
 def _number(value: float | None) -> str:
     return "–" if value is None else f"{value:.4g}"
 
 
-def _cells(row: dict[str, Any], part: str) -> dict[str, str]:
+def _cells(row: Mapping[str, Any], part: str) -> dict[str, str]:
     numbers = row[part]
     return {
         "q_min": _number(numbers.get("q_min")),
@@ -119,6 +128,12 @@ def _cells(row: dict[str, Any], part: str) -> dict[str, str]:
         "seconds": f"{row['seconds']:.2f}",
         "compile": f"{row['compile_seconds']:.1f}",
     }
+
+
+def columns(rows: Sequence[Mapping[str, Any]]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Heads and cells of the table over all elements, with steps and compilation."""
+    names = (*_WIDTHS, "steps", "compile")
+    return ("method", *names), [(row["method"], *(_cells(row, "all")[n] for n in names)) for row in rows]
 
 
 def print_head(out: Console) -> None:

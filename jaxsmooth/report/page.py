@@ -1,35 +1,27 @@
-"""The HTML report: one file that needs no network, with the mesh before and after to turn and to cut."""
+"""The HTML report: one file that needs no network, with meshes to turn and to cut, side by side."""
 
 from __future__ import annotations
 
 import html
 import json
-import math
-import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import jax
-import numpy as np
-
-import jaxsmooth
 from jaxsmooth.files.outputs import Outputs
 from jaxsmooth.mesh.record import Mesh
-from jaxsmooth.metrics.summary import POOR, evaluated
-from jaxsmooth.metrics.validity import inverted
-from jaxsmooth.report.holding import REASONS, Holding, holding
+from jaxsmooth.report import sections
+from jaxsmooth.report.compared import columns, recommend
+from jaxsmooth.report.holding import holding
 from jaxsmooth.report.report import comparison
-from jaxsmooth.report.scene import COLOURS, scene
+from jaxsmooth.report.scene import scene
 from jaxsmooth.runs.driver import SmoothResult
 
-__all__ = ["html_page", "write_html"]
+__all__ = ["html_comparison", "html_page", "write_html"]
 
 _ASSETS = Path(__file__).parent / "assets"
-_WORST = 12
 _COLUMNS = ("", "all before", "all after", "movable before", "movable after")
+_WORST = "Worst elements that are left; click to see one"
 
 
 def write_html(path: str | Path, title: str, before: Mesh, result: SmoothResult, **more: Any) -> None:
@@ -59,23 +51,94 @@ def html_page(
         notes: what was found in the file.
     """
     held = holding(before, result.constraints)
-    drawn = scene(before, result.mesh, held)
+    drawn = scene({"before": before, "after": result.mesh}, held)
     rows = drawn.pop("rows")
-    content = json.dumps(drawn, separators=(",", ":")).replace("<", "\\u003c")
+    steps = result.history[-1].step
+    body = (
+        _columns(
+            ("Quality before (line) and after (bars)", sections.histogram(before, result.mesh)),
+            ("Before and after", sections.table(_COLUMNS, comparison(before, result))),
+        ),
+        _section(_WORST, sections.worst(before, result, held, rows)),
+        _section("By type and region", sections.parts(before, result)),
+        _columns(
+            ("What the nodes may do", sections.nodes(held)),
+            ("Run", sections.run(result, settings or {}, seconds or {})),
+        ),
+        _section("Steps", sections.steps(result)),
+    )
+    status = f"{_sizes(before)}. {steps} steps: {result.status}."
+    return _filled(title, status, sections.cards(result), drawn, body, notes)
+
+
+def html_comparison(
+    title: str,
+    before: Mesh,
+    results: Mapping[str, SmoothResult],
+    rows: Sequence[Mapping[str, Any]],
+    *,
+    settings: Mapping[str, Any] | None = None,
+    notes: Sequence[str] = (),
+) -> str:
+    """Several methods on one mesh in one page: any two of their meshes side by side, and a table.
+
+    Args:
+        title: its heading; any text.
+        before: the input.
+        results: by method, of `smooth` with the same constraints.
+        rows: of `compare_row`, that of the input first, then as in `results`.
+        settings: options, by name.
+        notes: what was found in the file.
+    """
+    best, words = recommend(list(rows))
+    best = best if best in results else next(iter(results))
+    shown = results[best]
+    held = holding(before, shown.constraints)
+    drawn = scene({"input": before, **{name: result.mesh for name, result in results.items()}}, held)
+    drawn["right"] = 1 + list(results).index(best)
+    chosen = drawn.pop("rows")
+    heads, lines = columns(rows)
+    body = (
+        _section("Methods, over all elements", sections.table(heads, lines)),
+        _columns(
+            (
+                f"Quality of the input (line) and by {best} (bars)",
+                sections.histogram(before, shown.mesh),
+            ),
+            ("What the nodes may do", sections.nodes(held)),
+        ),
+        _section(f"{_WORST} ({best})", sections.worst(before, shown, held, chosen)),
+        _section("Run", sections.run(shown, settings or {}, {})),
+    )
+    advice = f"<p>{html.escape(' '.join(words))}</p>"
+    return _filled(title, f"{_sizes(before)}.", advice, drawn, body, notes)
+
+
+def _sizes(mesh: Mesh) -> str:
+    sizes = [f"{len(nodes):,} {name}" for name, nodes in zip(mesh.types, mesh.connectivity, strict=True)]
+    return f"{', '.join(sizes)}; {len(mesh.points):,} nodes"
+
+
+def _section(title: str, content: str) -> str:
+    return f"<section><h2>{html.escape(title)}</h2>{content}</section>"
+
+
+def _columns(*parts: tuple[str, str]) -> str:
+    return f'<div class="columns">{"".join(_section(*part) for part in parts)}</div>'
+
+
+def _filled(
+    title: str, status: str, lead: str, drawn: dict[str, Any], body: Sequence[str], notes: Sequence[str]
+) -> str:
+    """The template with everything in its place."""
+    items = "".join(f"<li>{html.escape(note)}</li>" for note in notes) or "<li>none</li>"
     values = {
         "TITLE": html.escape(title),
         "STYLE": (_ASSETS / "style.css").read_text(),
-        "STATUS": html.escape(_verdict(before, result)),
-        "CARDS": _cards(result),
-        "HISTOGRAM": _histogram(before, result.mesh),
-        "WORST": _worst(before, result, held, rows),
-        "STATISTICS": _table(_COLUMNS, comparison(before, result)),
-        "PARTS": _parts(before, result),
-        "HELD": _held(held),
-        "STEPS": _steps(result),
-        "RUN": _run(result, settings or {}, seconds or {}),
-        "NOTES": "".join(f"<li>{html.escape(note)}</li>" for note in notes) or "<li>none</li>",
-        "SCENE": content,
+        "STATUS": html.escape(status),
+        "LEAD": lead,
+        "BODY": "\n".join([*body, _section("Notes", f"<ul>{items}</ul>")]),
+        "SCENE": json.dumps(drawn, separators=(",", ":")).replace("<", "\\u003c"),
         "VIEWER": (_ASSETS / "viewer.js").read_text(),
     }
     page = (_ASSETS / "page.html").read_text()
@@ -83,177 +146,3 @@ def html_page(
     pieces = [part.partition("}}") for part in parts]
     text = head + "".join(values[name] + rest for name, _, rest in pieces)
     return text.encode("utf-8", "replace").decode()  # names of files may be any bytes
-
-
-def _verdict(before: Mesh, result: SmoothResult) -> str:
-    sizes = ", ".join(
-        f"{len(nodes):,} {name}" for name, nodes in zip(before.types, before.connectivity, strict=True)
-    )
-    steps = result.history[-1].step
-    return f"{sizes}; {len(before.points):,} nodes. {steps} steps: {result.status}."
-
-
-def _cards(result: SmoothResult) -> str:
-    first, last = result.history[0].statistics, result.history[-1].statistics
-    rows = (
-        ("least quality", f"{first.q_min:.3f}", f"{last.q_min:.3f}", last.q_min - first.q_min),
-        ("average quality", f"{first.q_avg:.3f}", f"{last.q_avg:.3f}", last.q_avg - first.q_avg),
-        (f"elements below {POOR}", f"{first.below:,}", f"{last.below:,}", first.below - last.below),
-        ("inverted elements", f"{first.inverted:,}", f"{last.inverted:,}", first.inverted - last.inverted),
-        (
-            "least scaled Jacobian",
-            f"{first.scaled_jacobian_min:.3f}",
-            f"{last.scaled_jacobian_min:.3f}",
-            last.scaled_jacobian_min - first.scaled_jacobian_min,
-        ),
-    )
-    return "".join(
-        f'<div class="card"><small>{name}</small><span>{old} → </span>'
-        f'<b class="{"good" if gain > 1e-6 else "bad" if gain < -1e-6 else ""}">{new}</b></div>'
-        for name, old, new, gain in rows
-    )
-
-
-# --- Histogram ----------------------------------------------------------------------------------------
-
-_WIDTH, _HEIGHT, _LEFT, _FOOT = 480, 200, 50, 34
-
-
-def _histogram(before: Mesh, after: Mesh) -> str:
-    """Elements by quality, logarithmic: the few worst are what counts."""
-    counts = [
-        np.histogram(np.clip(np.concatenate(evaluated(m).quality), 0, 1), np.linspace(0, 1, 21))[0].tolist()
-        for m in (before, after)
-    ]
-    decades = max(math.ceil(math.log10(max(max(part) for part in counts) + 1)), 1)
-    wide, high = (_WIDTH - _LEFT - 8) / 20, _HEIGHT - _FOOT - 8
-
-    def top(count: int) -> float:
-        return 8 + high * (1 - (math.log10(count) + 0.3) / (decades + 0.3)) if count else 8 + high
-
-    out = []
-    for decade in range(decades + 1):
-        y = top(10**decade)
-        out.append(f'<line x1="{_LEFT}" x2="{_WIDTH - 8}" y1="{y:.1f}" y2="{y:.1f}" stroke="var(--line)"/>')
-        label = f"{10**decade:,}"
-        out.append(f'<text x="{_LEFT - 5}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
-    for i, count in enumerate(counts[1]):
-        x, y = _LEFT + i * wide + 1, top(count)
-        out.append(
-            f'<rect x="{x:.1f}" y="{y:.1f}" width="{wide - 2:.1f}" height="{8 + high - y:.1f}" rx="2" '
-            f'fill="#1f6f8b" opacity=".85"><title>after: {count:,}</title></rect>'
-        )
-    steps = " ".join(
-        f"{_LEFT + (i + side) * wide:.1f},{top(count):.1f}"
-        for i, count in enumerate(counts[0])
-        for side in (0, 1)
-    )
-    out.append(f'<polyline points="{steps}" fill="none" stroke="#d9542f" stroke-width="2"/>')
-    for tenth in range(0, 11, 2):
-        x = _LEFT + 2 * tenth * wide
-        out.append(f'<text x="{x:.1f}" y="{_HEIGHT - 16}" text-anchor="middle">{tenth / 10:g}</text>')
-    out.append(f'<text x="{_LEFT}" y="{_HEIGHT - 2}">quality</text>')
-    return f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="histogram">{"".join(out)}</svg>'
-
-
-# --- Tables -------------------------------------------------------------------------------------------
-
-
-def _table(heads: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    def line(cells: Sequence[Any], tag: str) -> str:
-        return "<tr>" + "".join(f"<{tag}>{html.escape(str(c))}</{tag}>" for c in cells) + "</tr>"
-
-    body = "".join(line(row, "td") for row in rows)
-    return f'<div class="scroll"><table>{line(heads, "th")}{body}</table></div>'
-
-
-def _worst(before: Mesh, result: SmoothResult, held: Holding, rows: list[tuple[int, np.ndarray]]) -> str:
-    """The worst elements that are left; a click shows them."""
-    q = [[np.asarray(part) for part in evaluated(mesh).quality] for mesh in (before, result.mesh)]
-    shown = np.concatenate([q[1][b][chosen] for b, chosen in rows])
-    block = np.concatenate([np.full(len(chosen), b) for b, chosen in rows])
-    number = np.concatenate([chosen for _, chosen in rows])
-    points = np.asarray(result.mesh.points, np.float64)
-    lines = []
-    for place in np.argsort(shown, kind="stable")[:_WORST]:
-        b, e = int(block[place]), int(number[place])
-        kind, nodes = before.blocks[b][0], np.asarray(before.connectivity[b])[e]
-        centre = ", ".join(f"{x:.4g}" for x in points[nodes[: kind.corners]].mean(axis=0))
-        cells = (f"{kind.name} {e}", f"{q[0][b][e]:.3f}", f"{q[1][b][e]:.3f}", centre)
-        words = html.escape(held.of(nodes))
-        lines.append(
-            f'<tr data-element="{place}">'
-            + "".join(f"<td>{cell}</td>" for cell in cells)
-            + f'<td class="words">{words}</td></tr>'
-        )
-    heads = "".join(f"<th>{name}</th>" for name in ("element", "q before", "after", "place"))
-    head = f'{heads}<th style="text-align:left">its nodes</th>'
-    return f'<div class="scroll"><table><tr>{head}</tr>{"".join(lines)}</table></div>'
-
-
-def _parts(before: Mesh, result: SmoothResult) -> str:
-    """Statistics by type and by region."""
-    sides = []
-    for mesh in (before, result.mesh):
-        evaluation = evaluated(mesh)
-        sides.append([np.asarray(part, float) for part in evaluation.quality])
-        sides.append([np.asarray(part) for part in inverted(mesh, evaluation.jacobian)])
-    regions = [np.zeros(len(nodes), int) for nodes in before.connectivity]
-    if before.labels is not None and before.labels.regions:
-        regions = [np.asarray(part) for part in before.labels.regions]
-    names = _region_names(before, result)
-    several, rows = len(np.unique(np.concatenate(regions))) > 1, []
-    for b, name in enumerate(before.types):
-        for region in np.unique(regions[b]):
-            mask = regions[b] == region
-            old, bad, new, worse = (side[b][mask] for side in sides)
-            label = f"{name}, {names.get(int(region), f'region {region}')}" if several else name
-            pairs = ((old.min(), new.min()), (old.mean(), new.mean()))
-            numbers = [f"{x:.3f} → {y:.3f}" for x, y in pairs]
-            poor = f"{int((old < POOR).sum()):,} → {int((new < POOR).sum()):,}"
-            rows.append((label, f"{mask.sum():,}", *numbers, poor, f"{bad.sum():,} → {worse.sum():,}"))
-    heads = ("type and region", "elements", "q_min", "q_avg", f"q < {POOR}", "inverted")
-    return _table(heads, rows)
-
-
-def _region_names(before: Mesh, result: SmoothResult) -> dict[int, str]:
-    """Names of physical groups by their tags."""
-    known = {} if result.file is None else result.file.source.field_data
-    pairs = {name: np.ravel(entry) for name, entry in known.items() if np.size(entry) == 2}
-    return {int(tag): str(name) for name, (tag, dim) in pairs.items() if dim == before.element_dim}
-
-
-def _held(held: Holding) -> str:
-    total = len(held.reason)
-    rows = "".join(
-        f'<tr><td><span class="dot" style="background:{COLOURS[REASONS.index(name)]}"></span>{name}</td>'
-        f"<td>{number:,}</td><td>{100 * number / total:.1f} %</td></tr>"
-        for name, number in held.counts()
-    )
-    return f"<table><tr><th>nodes</th><th>number</th><th>share</th></tr>{rows}</table>"
-
-
-def _steps(result: SmoothResult) -> str:
-    heads = ("step", "q_min", "q_avg", "q_max", "σ", f"q < {POOR}", "inverted", "iterations", "seconds")
-    rows = []
-    for row in result.history:
-        s = asdict(row.statistics)
-        numbers = [f"{s[key]:.4f}" for key in ("q_min", "q_avg", "q_max", "q_std")]
-        tail = (f"{s['below']:,}", f"{s['inverted']:,}", row.solver_iterations, f"{row.seconds:.2f}")
-        rows.append((row.step, *numbers, *tail))
-    return _table(heads, rows)
-
-
-def _run(result: SmoothResult, settings: Mapping[str, Any], seconds: Mapping[str, float]) -> str:
-    device = jax.devices()[0]
-    times = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items())
-    facts = {
-        **{name: value for name, value in settings.items() if value not in (None, "", [], False)},
-        **({"time": times} if times else {}),
-        "precision": result.mesh.points.dtype,
-        "device": f"{device.device_kind} ({jax.default_backend()})",
-        "versions": f"jaxsmooth {jaxsmooth.__version__}, JAX {version('jax')}, NumPy {np.__version__}, "
-        f"Python {platform.python_version()}",
-    }
-    pairs = (f"<dt>{html.escape(str(k))}</dt><dd>{html.escape(str(v))}</dd>" for k, v in facts.items())
-    return f"<dl>{''.join(pairs)}</dl>"

@@ -1,8 +1,9 @@
-"""A mesh before and after as the viewer of a report takes it: numbers in base64, facets as rings of nodes."""
+"""States of a mesh as the viewer of a report takes them: numbers in base64, facets as rings of nodes."""
 
 from __future__ import annotations
 
 import base64
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -25,18 +26,18 @@ _BUDGET = 1_000_000  # node numbers in a file: 4 MB, 5.3 in base64
 _QUALITY = 32_000  # what q = 1 is stored as
 
 
-def scene(before: Mesh, after: Mesh, held: Holding) -> dict[str, Any]:
+def scene(states: Mapping[str, Mesh], held: Holding) -> dict[str, Any]:
     """What the viewer draws.
 
     Meshes of up to a quarter of a million tetrahedra are there as a whole; of larger ones the boundary and
     the poorest elements.
 
     Args:
-        before: the input.
-        after: the same topology.
+        states: by name, meshes of one topology, the input first.
         held: what its nodes may do.
     """
-    q = [[np.asarray(part) for part in evaluated(mesh).quality] for mesh in (before, after)]
+    before, *_ = states.values()
+    q = [[np.asarray(part) for part in evaluated(mesh).quality] for mesh in states.values()]
     kept = _kept(before, q)
     blocks, rows = [], []
     for b, (kind, nodes) in enumerate(before.blocks):
@@ -53,24 +54,29 @@ def scene(before: Mesh, after: Mesh, held: Holding) -> dict[str, Any]:
     wide = len(before.points) > 2**16 - 1
     for block in blocks:
         block["nodes"] = _text(block["nodes"], np.uint32 if wide else np.uint16)
-    moved = np.linalg.norm(np.asarray(after.points, float) - np.asarray(before.points, float), axis=1)
-    farthest = float(moved.max(initial=0.0))
+    moved = [np.linalg.norm(_space(mesh) - _space(before), axis=1) for mesh in states.values()]
+    farthest = float(max(part.max(initial=0.0) for part in moved))
     numbers = np.bincount(held.reason, minlength=len(REASONS))
     return {
         "dim": before.dim,
         "flat": all(kind.dim == 2 for kind, _ in before.blocks),
         "wide": wide,
-        "before": _text(_space(before), np.float32),
-        "after": _text(_space(after), np.float32),
+        "states": [
+            {
+                "name": name,
+                "points": _text(_space(mesh), np.float32),
+                "quality": _text(_stored(np.concatenate(side)), np.int16),
+                "moved": _text(np.rint(65535 * part / (farthest or 1)), np.uint16),
+            }
+            for (name, mesh), side, part in zip(states.items(), values, moved, strict=True)
+        ],
         "blocks": blocks,
         "ids": None if all(mask.all() for mask in kept) else [int(i) for _, part in rows for i in part],
-        "quality": [_text(_stored(np.concatenate(side)), np.int16) for side in values],
         "reason": _text(held.reason, np.uint8),
         "reasons": [
             {"name": name, "colour": colour, "count": int(number)}
             for name, colour, number in zip(REASONS, COLOURS, numbers, strict=True)
         ],
-        "moved": _text(np.rint(65535 * moved / (farthest or 1)), np.uint16),
         "farthest": f"{farthest:.3g}",
         "rows": rows,
     }
@@ -79,7 +85,7 @@ def scene(before: Mesh, after: Mesh, held: Holding) -> dict[str, Any]:
 def _kept(mesh: Mesh, q: list[list[np.ndarray]]) -> list[np.ndarray]:
     """Masks of the elements that are there as such: all, or the poorest."""
     cost = np.concatenate([np.full(len(nodes), kind.k) for kind, nodes in mesh.blocks])
-    poorest = np.minimum(*(np.concatenate(side) for side in q))
+    poorest = np.minimum.reduce([np.concatenate(side) for side in q])
     order = np.argsort(poorest, kind="stable")
     total = np.cumsum(cost[order])
     most = _BUDGET if total[-1] <= _BUDGET else _BUDGET // 4

@@ -1,5 +1,5 @@
 "use strict";
-// The picture of a report: two views of one mesh, drawn with WebGL 2.  No library, no request.
+// The picture of a report: two states of one mesh, drawn with WebGL 2.  No library, no request.
 const data = JSON.parse(document.getElementById("scene").textContent);
 const UNIT = 32000; // what q = 1 is stored as
 const $ = (id) => document.getElementById(id);
@@ -11,15 +11,18 @@ function numbers(text, Kind) {
 
 // --- The mesh: elements, their facets, and which facets meet -------------------------------------------
 
+// The sides show two states of all that there are: before and after, or methods to choose from.
+const SIDES = ["before", "after"];
+const shownState = { before: 0, after: data.right ?? 1 };
 const mesh = load(data);
 const state = { view: "both", colour: "quality", below: 1, axis: -1, cut: 1, flip: false, edges: true, chosen: -1 };
 const camera = { az: data.dim === 3 ? -0.95 : -Math.PI / 2, el: data.dim === 3 ? 0.5 : Math.PI / 2, zoom: 1, x: 0, y: 0 };
 let target = mesh.centre.slice();
 
 function load(scene) {
-  const points = { before: numbers(scene.before, Float32Array), after: numbers(scene.after, Float32Array) };
-  const quality = { before: numbers(scene.quality[0], Int16Array), after: numbers(scene.quality[1], Int16Array) };
-  const elements = quality.before.length;
+  const states = scene.states.map((s) => ({ name: s.name, points: numbers(s.points, Float32Array),
+    quality: numbers(s.quality, Int16Array), moved: numbers(s.moved, Uint16Array) }));
+  const elements = states[0].quality.length;
   const rings = [], owner = [], firstFacet = new Uint32Array(elements + 1);
   let element = 0;
   for (const block of scene.blocks) {
@@ -35,16 +38,16 @@ function load(scene) {
   firstFacet[elements] = rings.length;
   const step = scene.blocks.flatMap((b) => new Array(b.count).fill(b.curved ? 2 : 1));
   const lo = [Infinity, Infinity, Infinity], hi = [-Infinity, -Infinity, -Infinity];
-  for (const side of [points.before, points.after])
-    for (let i = 0; i < side.length; i++) {
+  for (const { points } of states)
+    for (let i = 0; i < points.length; i++) {
       const k = i % 3;
-      if (side[i] < lo[k]) lo[k] = side[i];
-      if (side[i] > hi[k]) hi[k] = side[i];
+      if (points[i] < lo[k]) lo[k] = points[i];
+      if (points[i] > hi[k]) hi[k] = points[i];
     }
   const centre = lo.map((x, k) => (x + hi[k]) / 2);
   const radius = Math.hypot(...lo.map((x, k) => (hi[k] - x) / 2)) || 1;
-  return { points, quality, elements, rings, owner, step, firstFacet, lo, hi, centre, radius, mate: mates(rings, step, owner),
-    reason: numbers(scene.reason, Uint8Array), moved: numbers(scene.moved, Uint16Array) };
+  return { states, points: {}, quality: {}, moved: {}, centroid: {}, elements, rings, owner, step, firstFacet, lo, hi, centre,
+    radius, mate: mates(rings, step, owner), reason: numbers(scene.reason, Uint8Array) };
 }
 
 function mates(rings, step, owner) {
@@ -71,7 +74,15 @@ function centroids(side) {
   }
   return out;
 }
-mesh.centroid = { before: centroids("before"), after: centroids("after") };
+
+function setState(side, index) {
+  shownState[side] = index;
+  for (const what of ["points", "quality"]) mesh[what][side] = mesh.states[index][what];
+  mesh.centroid[side] = centroids(side);
+  for (const one of SIDES) // of the input: how far its nodes are from where the other side has them
+    mesh.moved[one] = mesh.states[shownState[one] || shownState.before || shownState.after].moved;
+}
+SIDES.forEach((side) => setState(side, shownState[side]));
 
 // --- What is shown --------------------------------------------------------------------------------------
 
@@ -122,7 +133,7 @@ function build(side, show) {
 }
 
 function value(side, e, p) {
-  if (state.colour === "moved") return mesh.moved[p] / 65535;
+  if (state.colour === "moved") return mesh.moved[side][p] / 65535;
   if (state.colour === "held") return 0.5;
   const q = mesh.quality[side][e];
   return q < 0 ? -1 : Math.min(q / UNIT, 1);
@@ -143,7 +154,6 @@ const gl = canvas.getContext("webgl2", { alpha: false, antialias: true, preserve
 const scales = {
   quality: ["#8f1030", "#d9442f", "#f2a541", "#f6dd74", "#8ccbb0", "#3f9aa6", "#1f6f8b"],
   moved: ["#eef3f5", "#b5d5e2", "#6aaecb", "#2f7fae", "#1c4f86", "#14275a"], held: ["#dfe6ea", "#dfe6ea"] };
-const SIDES = ["before", "after"];
 const drawn = {};
 let program, points_, ghost = {};
 
@@ -220,7 +230,7 @@ function refresh() {
   const all = words.every((n) => n === mesh.elements);
   const text = (n) => `${n.toLocaleString("en")} of ${mesh.elements.toLocaleString("en")}`;
   $("shown").textContent = all ? `all ${mesh.elements.toLocaleString("en")} elements` :
-    `${text(words[0])} elements before, ${text(words[1])} after`;
+    `${text(words[0])} elements ${nameOf("before")}, ${text(words[1])} ${nameOf("after")}`;
   canvas.dataset.shown = words.join(" ");
   legend();
   draw();
@@ -401,6 +411,27 @@ canvas.addEventListener("wheel", (e) => {
   draw();
 }, { passive: false });
 
+const nameOf = (side) => mesh.states[shownState[side]].name;
+
+function whole(side) {
+  const built = build(side, new Uint8Array(mesh.elements).fill(1));
+  ghost[side] = { buffer: buffer(built.floats, (ghost[side] || {}).buffer), count: built.count };
+}
+
+function label(side) {
+  $(`only-${side}`).textContent = nameOf(side);
+  const tag = $(`tag-${side}`);
+  if (mesh.states.length === 2) { tag.textContent = nameOf(side); return; }
+  const select = document.createElement("select");
+  mesh.states.forEach((one, i) => select.add(new Option(one.name, i, false, i === shownState[side])));
+  select.addEventListener("change", () => {
+    setState(side, +select.value);
+    $(`only-${side}`).textContent = nameOf(side);
+    whole(side); choose(state.chosen, false); refresh();
+  });
+  tag.replaceChildren(select);
+}
+
 function legend() {
   const bar = $("legend"), stops = scales[state.colour];
   const ends = state.colour === "moved" ? ["0", data.farthest] : ["q = 0", "1"];
@@ -423,10 +454,7 @@ function start() {
   points_ = compile(DOT_VERTEX, DOT_FRAGMENT);
   gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
   setScale("quality");
-  for (const side of SIDES) {
-    const built = build(side, new Uint8Array(mesh.elements).fill(1));
-    ghost[side] = { buffer: buffer(built.floats), count: built.count };
-  }
+  for (const side of SIDES) { whole(side); label(side); }
   group("view", (v) => { state.view = v; $("stage").dataset.view = v; draw(); });
   group("colour", (v) => { state.colour = v; setScale(v); refresh(); });
   group("axis", (v) => { state.axis = +v; $("cut").disabled = state.axis < 0; if (state.axis >= 0 && state.cut === 1) $("cut").value = state.cut = 0.5; refresh(); });
