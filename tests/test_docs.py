@@ -1,8 +1,9 @@
 """The pages in docs: their code runs, they have all public names, and what they link to is there."""
 
+import os
 import re
 from importlib import import_module
-from importlib.util import find_spec
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import jax
@@ -134,5 +135,25 @@ def test_the_comparison_says_what_was_measured():
 
 
 def test_the_site_has_all_pages():
-    named = re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text())
-    assert sorted(f"docs/{name}" for name in named) == PAGES
+    named = re.findall(r"^ +- (?:[^:\n]+: )?([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.M)
+    notebooks = [f"docs/notebooks/{path.stem}.md" for path in (ROOT / "notebooks").glob("*.ipynb")]
+    made = [*notebooks, "docs/benchmarks.md", "docs/changes.md", "docs/gallery.md"]
+    assert sorted(f"docs/{name}" for name in named) == sorted([*PAGES, *made])
+
+
+def test_the_pages_that_are_made_have_pictures_and_links_that_lead_somewhere():
+    pytest.importorskip("mkdocs")
+    pytest.importorskip("nbconvert")
+    spec = spec_from_file_location("made", DOCS / "made.py")
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    pages = module.made()
+    there = {*pages, *(str(Path(page).relative_to("docs")) for page in PAGES)}
+    for name, text in pages.items():
+        if isinstance(text, bytes):
+            assert text.startswith(b"\x89PNG")
+            continue
+        for link in re.findall(r"\]\((?!https?:|#|data:)([^)#]+)", text):
+            assert os.path.normpath(Path(name).parent / link) in there, (name, link)
+    for path in (ROOT / "notebooks").glob("*.ipynb"):
+        assert f"[![](notebooks/{path.stem}" in pages["gallery.md"]
