@@ -12,9 +12,10 @@ import meshio
 import numpy as np
 import pytest
 from test_curved import disc
-from test_readme import ROOT, blocks
+from test_readme import ROOT
 
 import jaxsmooth as js
+from jaxsmooth.cli import main
 
 DOCS = ROOT / "docs"
 PAGES = sorted(str(path.relative_to(ROOT)) for path in DOCS.rglob("*.md"))
@@ -55,14 +56,76 @@ def files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if "```python" in (ROOT / page).read_text()])
+def follow(page):
+    """Do what a page says, Python and commands in their order; returns the names that it made."""
+    names, text = {}, (ROOT / page).read_text()
+    for kind, code in re.findall(r"^```(python|sh)\n(.*?)^```$", text, re.M | re.S):
+        if kind == "python":
+            line = text[: text.index(code)].count("\n")
+            exec(compile("\n" * line + code, str(ROOT / page), "exec"), names)
+        for command in code.splitlines() if kind == "sh" else ():
+            if command.startswith("jaxsmooth "):
+                assert main(command.split()[1:]) in (0, 3)  # 3: inverted elements are left
+    return names
+
+
+# --- Five tasks, done by what their pages say ----------------------------------------------------------
+
+
+def test_task_smooth_my_file(files):
+    follow("docs/index.md")
+    before, after = (meshio.read(name) for name in ("part.msh", "part-smooth.vtu"))
+    np.testing.assert_array_equal(before.cells_dict["tetra"], after.cells_dict["tetra"])
+    moved = np.linalg.norm(after.points - before.points, axis=1) > 1e-6
+    outer = (np.isclose(before.points, 0) | np.isclose(before.points, 1)).sum(axis=1)
+    assert moved.any()
+    assert not moved[outer == 3].any()
+    assert "<html" in Path("report.html").read_text()
+
+
+def test_task_keep_the_layer(files):
+    found = follow("docs/how/layers.md")
+    before, after = meshio.read("layers.vtu").points, np.asarray(found["result"].mesh.points)
+    low = before[:, 1] < 0.02
+    assert low.sum() == 36
+    np.testing.assert_array_equal(after[low], before[low, :2])
+    assert np.abs(after - before[:, :2]).max() > 1e-3
+
+
+def test_task_a_periodic_cell(files):
+    follow("docs/how/periodic.md")
+    before, after = (meshio.read(name).points for name in ("cell.vtu", "cell-smooth.vtu"))
+    left, right = (np.flatnonzero(np.isclose(before[:, 0], x)) for x in (0, 1))
+    left, right = (part[np.lexsort(before[part][:, 1:].T)] for part in (left, right))
+    np.testing.assert_allclose(after[left, 1:], after[right, 1:], atol=1e-6)
+    assert np.abs(after - before).max() > 1e-3
+
+
+def test_task_the_gradient_of_my_objective(files):
+    found = follow("docs/how/gradients.md")
+    points, objective = found["mesh"].points, jax.jit(found["objective"])
+    direction = np.random.default_rng(0).normal(size=points.shape)
+    expected = (objective(points + 1e-5 * direction) - objective(points - 1e-5 * direction)) / 2e-5
+    np.testing.assert_allclose(np.vdot(found["gradient"], direction), expected, rtol=1e-5)
+
+
+def test_task_choose_a_method(files, capsys):
+    follow("docs/how/methods.md")
+    said = capsys.readouterr().out
+    assert re.search(r"^Take [a-z-]+: .*q_avg", said, re.M)
+
+
+TASKS = ("docs/index.md", *(f"docs/how/{name}.md" for name in ("layers", "periodic", "gradients", "methods")))
+
+
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if "```python" in (ROOT / page).read_text() and page not in TASKS]
+)
 def test_the_code_of_the_pages_runs(page, files):
     if "libraries" in page:
         for name in ("pyvista", "skfem", "gmsh"):
             pytest.importorskip(name)
-    names = {}
-    for line, code in blocks(page, "python"):
-        exec(compile("\n" * line + code, str(ROOT / page), "exec"), names)
+    names = follow(page)
     for name in ("gradient", "result"):
         for leaf in jax.tree.leaves(getattr(names.get(name), "points", names.get(name))):
             if isinstance(leaf, jax.Array):

@@ -17,8 +17,8 @@ from test_curved import ball
 import jaxsmooth as js
 from jaxsmooth.mesh.topology import find_facets
 from jaxsmooth.report import scene as scenes
-from jaxsmooth.report.holding import REASONS, holding
 from jaxsmooth.report.compared import compare_row
+from jaxsmooth.report.holding import REASONS, holding
 from jaxsmooth.report.page import html_comparison, html_page
 from jaxsmooth.report.scene import scene
 

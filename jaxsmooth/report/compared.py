@@ -53,7 +53,7 @@ def compare_row(
 # --- Which to take ---------------------------------------------------------------------
 
 
-def recommend(rows: list[dict[str, Any]]) -> tuple[str, list[str]]:
+def recommend(rows: Sequence[dict[str, Any]]) -> tuple[str, list[str]]:
     """The method to take, or ``input``, and the reasons.
 
     The fewest inverted elements come first, then the fewest poor ones, then the average quality.  Of those

@@ -75,7 +75,7 @@ def html_comparison(
     title: str,
     before: Mesh,
     results: Mapping[str, SmoothResult],
-    rows: Sequence[Mapping[str, Any]],
+    rows: Sequence[dict[str, Any]],
     *,
     settings: Mapping[str, Any] | None = None,
     notes: Sequence[str] = (),
@@ -90,7 +90,7 @@ def html_comparison(
         settings: options, by name.
         notes: what was found in the file.
     """
-    best, words = recommend(list(rows))
+    best, words = recommend(rows)
     best = best if best in results else next(iter(results))
     shown = results[best]
     held = holding(before, shown.constraints)
