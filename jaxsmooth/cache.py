@@ -11,7 +11,7 @@ from pathlib import Path
 __all__ = ["cache_folder", "keep_compiled"]
 
 _LARGEST = 512 * 2**20  # bytes; the programs that were not used for longest go first
-_SECONDS = 0.2  # what is compiled faster is not worth a file, unless JAX's own variable says otherwise
+_SECONDS = 0.02  # to compile; what takes less is not worth a file, unless JAX's own variable says otherwise
 _OFF = ("off", "0", "")
 
 
@@ -44,7 +44,7 @@ def keep_compiled(folder: str | os.PathLike | None = None) -> Path | None:
     """Keep what JAX compiles from now on, and use what was kept.
 
     The command line does so by default.  Several processes may share a folder.  Programs that compile faster
-    than 0.2 s, or ``JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS``, are not kept.  Where XLA complains about
+    than 0.02 s, or ``JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS``, are not kept.  Where XLA complains about
     features of the processor as it loads a program, nothing is wrong; ``TF_CPP_MIN_LOG_LEVEL=3`` in the
     environment, set before JAX is imported, silences it.
 
