@@ -90,8 +90,8 @@ def _rotation_3d(h: Matrix) -> Matrix:
     choice is made: the compiler may evaluate one twice, with other rounding.
     """
     h = _scaled(h)
-    n = _horn(h)
-    m = _adjugate(*(_largest_eigenvalue(h) * d - x for x, d in zip(n, _DIAGONAL, strict=True)))
+    n, largest = _horn(h), _largest_eigenvalue(h)
+    m = _adjugate(*(largest * d - x if d else -x for x, d in zip(n, _DIAGONAL, strict=True)))
 
     def unit(q):
         square = sum(x * x for x in q)

@@ -33,23 +33,33 @@ def contract(points: Float[Array, "k dim"], gradients: Float[Array, "q k j"]) ->
 
 def cofactors(a: Float[Array, "... dim dim"]) -> Float[Array, "... dim dim"]:
     """Cofactor matrix: ``cofactors(a).T / det(a)`` is the inverse."""
-    if a.shape[-1] == 2:
-        rows = [[a[..., 1, 1], -a[..., 1, 0]], [-a[..., 0, 1], a[..., 0, 0]]]
+    m = _entries(a)
+    if len(m) == 2:
+        rows = [[m[1][1], -m[1][0]], [-m[0][1], m[0][0]]]
     else:
-        rows = [[_minor(a, i, j) for j in range(3)] for i in range(3)]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+        rows = [[_minor(m, i, j) for j in range(3)] for i in range(3)]
+    return jnp.stack([part for row in rows for part in row], axis=-1).reshape(a.shape)
 
 
-def _minor(a: Array, i: int, j: int) -> Array:
+def _entries(a: Float[Array, "... dim dim"]) -> list[list[Array]]:
+    """Row by row; taken all at once, for indices are most of what tracing such formulas costs."""
+    dim = a.shape[-1]
+    parts = jax.lax.split(a.reshape(*a.shape[:-2], dim * dim), (1,) * dim**2, axis=a.ndim - 2)
+    numbers = [jax.lax.squeeze(part, (part.ndim - 1,)) for part in parts]
+    return [numbers[dim * i : dim * (i + 1)] for i in range(dim)]
+
+
+def _minor(m: list[list[Array]], i: int, j: int) -> Array:
     r, s, c, d = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
-    return a[..., r, c] * a[..., s, d] - a[..., r, d] * a[..., s, c]
+    return m[r][c] * m[s][d] - m[r][d] * m[s][c]
 
 
 def determinant(a: Float[Array, "... dim dim"]) -> Float[Array, ...]:
     """Determinant by expansion along the first row."""
-    if a.shape[-1] == 2:
-        return a[..., 0, 0] * a[..., 1, 1] - a[..., 0, 1] * a[..., 1, 0]
-    first, second, third = (a[..., 0, j] * _minor(a, 0, j) for j in range(3))
+    m = _entries(a)
+    if len(m) == 2:
+        return m[0][0] * m[1][1] - m[0][1] * m[1][0]
+    first, second, third = (m[0][j] * _minor(m, 0, j) for j in range(3))
     return first + second + third
 
 
