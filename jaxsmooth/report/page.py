@@ -67,7 +67,7 @@ def html_page(
         ),
         _section("Steps", sections.steps(result)),
     )
-    status = f"{_sizes(before)}. {steps} steps: {result.status}."
+    status = f"{_sizes(before)}. {steps} step{'s' * (steps != 1)}: {result.status}."
     return _filled(title, status, sections.cards(result), drawn, body, notes)
 
 
