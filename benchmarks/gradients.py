@@ -127,7 +127,7 @@ def compare_batch(name: str, function, batch: np.ndarray) -> None:
     single, many = jax.jit(function), jax.jit(jax.vmap(function))
     devices = jax.make_mesh((jax.device_count(),), ("batch",))
     part = jax.sharding.PartitionSpec("batch")
-    specs = {"mesh": devices, "in_specs": part, "out_specs": part, "check_vma": False}
+    specs = {"mesh": devices, "in_specs": part, "out_specs": part}
     spread = jax.jit(jax.shard_map(jax.vmap(function), **specs))
     placed = jax.device_put(batch, jax.NamedSharding(devices, part))
     loop = seconds(lambda points: [single(p) for p in points], batch, repeats=15)

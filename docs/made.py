@@ -89,4 +89,5 @@ def _number(value: float | None) -> str:
 def _linked(text: str) -> str:
     """Links from the root of the project as links from the root of the site; others lose theirs."""
     text = re.sub(r"\]\(docs/", "](", text)
+    text = re.sub(r"\]\(benchmarks/(\w+)\.md\)", lambda found: found[0].lower(), text)
     return re.sub(r"\[([^\]]+)\]\((?!https?:|[\w/]+\.md)[^)]*\)", r"\1", text)

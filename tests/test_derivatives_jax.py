@@ -99,15 +99,15 @@ def value(points):
     return (done.points ** 2).sum() + js.quality_mean(done)
 
 slope = jax.vmap(jax.grad(value))
-unchecked = jax.shard_map(slope, mesh=devices, in_specs=P("d"), out_specs=P("d"), check_vma=False)
-plain, mapped = (jax.jit(f)(jax.device_put(points, split)) for f in (slope, unchecked))
+checked = jax.shard_map(slope, mesh=devices, in_specs=P("d"), out_specs=P("d"))
+plain, mapped = (jax.jit(f)(jax.device_put(points, split)) for f in (slope, checked))
 assert np.abs(plain).max() > 0.1
 np.testing.assert_allclose(plain, mapped, atol=1e-9)
 """
 
 
-def test_gradients_of_runs_are_split_among_devices():
-    """Of an input that is split over a device mesh, and under `shard_map` as the README says."""
+def test_gradients_are_split_among_devices():
+    """Of an input that is split over a device mesh, and under `shard_map` with its checks on."""
     here = Path(__file__).parent
     env = os.environ | {"PYTHONPATH": f"{here}{os.pathsep}{here.parent}"}
     done = subprocess.run(

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxsmooth.numerics.solve import gradient_tolerance
+from jaxsmooth.numerics.varying import varying_like
 
 __all__ = ["attach_root", "conjugate_residuals", "undefined_unless", "undifferentiated"]
 
@@ -96,14 +97,14 @@ def conjugate_residuals(
         directions, images = s.directions.at[slot].set(p), s.images.at[slot].set(q)
         return _Iterate(s.x + step * p, s.r - step * q, directions, images, s.done + 1)
 
-    none = jnp.zeros((_KEPT, *b.shape), b.dtype)
+    none = varying_like(jnp.zeros((_KEPT, *b.shape), b.dtype), b)
 
     def again(_, state):
         x, r, count = state
         end = jax.lax.while_loop(unfinished, iterate, _Iterate(x, r, none, none, count))
         return end.x, b - matvec(end.x), end.done
 
-    x, r, _ = jax.lax.fori_loop(0, 3, again, (jnp.zeros_like(b), b, jnp.int32(0)))
+    x, r, _ = jax.lax.fori_loop(0, 3, again, varying_like((jnp.zeros_like(b), b, jnp.int32(0)), b))
     length = jnp.linalg.norm(b)
     residual = jnp.linalg.norm(r) / jnp.where(length > 0, length, 1)
     return undefined_unless(residual, tolerance, x) * size

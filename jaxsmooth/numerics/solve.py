@@ -163,7 +163,9 @@ def solve_projected(
         The displacement u, with the iterations it took and its true relative residual.
     """
     system = (operator, jax.lax.stop_gradient(diagonal), admissible, force)
-    field, (iterations, residual) = _solve(system, tolerance, max_iterations)
+    given = system, tolerance, max_iterations
+    # within `shard_map` JAX would cast constants of the linear solve a second time
+    field, (iterations, residual) = _solve(*varying_like(given, given))
     return Solution(admissible.followed(field), iterations.astype(jnp.int32), residual)
 
 

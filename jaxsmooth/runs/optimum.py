@@ -18,6 +18,7 @@ from jaxsmooth.numerics.admissible import Admissible
 from jaxsmooth.numerics.implicit import attach_root, undefined_unless
 from jaxsmooth.numerics.small import Frame, in_precision
 from jaxsmooth.numerics.solve import apply_blocks, conjugate_gradients, gradient_tolerance
+from jaxsmooth.numerics.varying import varying_like
 
 __all__ = ["Optimum", "optimum"]
 
@@ -84,8 +85,10 @@ def optimum(
     tolerance = gradient_tolerance(mesh.points.dtype) if tolerance is None else tolerance
     frame = Frame.of(mesh.points)
     points, within = frame.into(mesh.points), motion.within(frame)
+    # within `shard_map` JAX would cast constants of the linear solve a second time
+    mesh, frame = varying_like((mesh, frame), points)
     here = _Search(mesh, frame, tolerance, max_iterations)
-    parameters = (energy, points, within)
+    parameters: tuple[Energy, Field, Motion] = varying_like((energy, points, within), points)
     end = here.search(*jax.lax.stop_gradient(parameters), max_steps)
     solve = here.solver(end.u, *jax.lax.stop_gradient(parameters))
     u = attach_root(here.residual, end.u, parameters, solve)
@@ -180,6 +183,7 @@ class _Search(NamedTuple):
                 return length / 2, value(state.u + length / 2 * move), halvings + 1
 
             start = (jnp.full((), 2.0, points.dtype), jnp.full((), jnp.inf, points.dtype), jnp.int32(-1))
+            start = varying_like(start, points)
             length, after, halvings = jax.lax.while_loop(rejected, halve, start)
             stuck = halvings >= _HALVINGS
             u, after = (
@@ -190,7 +194,7 @@ class _Search(NamedTuple):
 
         begun = Newton(iterations=30, tolerance=1e-6)(task, points).points
         u = motion.at(points).independent(begun - points)
-        start = measured(u, value(u), jnp.int32(0), jnp.bool_(False))
+        start = varying_like(measured(u, value(u), jnp.int32(0), jnp.bool_(False)), points)
         return jax.lax.while_loop(unfinished, again, start)
 
     def _direction(self, state: _State, fixed: tuple[Energy, Field, Motion]) -> Field:

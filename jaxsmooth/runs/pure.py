@@ -243,7 +243,8 @@ def fixed_point(
             new = displaced(u, *fixed)
             return new, jnp.abs(new - u).max() / extent, count + 1
 
-        return jax.lax.while_loop(unfinished, again, (u, jnp.asarray(jnp.inf, u.dtype), jnp.int32(0)))
+        start = varying_like((u, jnp.asarray(jnp.inf, u.dtype), jnp.int32(0)), points)
+        return jax.lax.while_loop(unfinished, again, start)
 
     u, change, count = search(jnp.zeros_like(points))
 

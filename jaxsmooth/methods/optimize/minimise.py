@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 from jaxsmooth.methods.optimize.distortion import regularisation
 from jaxsmooth.methods.optimize.problem import Problem
 from jaxsmooth.numerics.solve import apply_blocks, block_inverse, conjugate_gradients
+from jaxsmooth.numerics.varying import varying_like
 
 __all__ = ["Jaxopt", "Minimised", "Minimiser", "Newton", "Optax", "Optimistix"]
 
@@ -95,9 +96,8 @@ class Newton(Minimiser):
                 length = length / 2
                 return length, *problem.value(place(length), eps), halvings + 1
 
-            length, after, least, halvings = jax.lax.while_loop(
-                rejected, halve, (2.0 * one, jnp.inf * one, -one, jnp.int32(-1))
-            )
+            first = varying_like((2.0 * one, jnp.inf * one, -one, jnp.int32(-1)), points)
+            length, after, least, halvings = jax.lax.while_loop(rejected, halve, first)
             accepted = (halvings < _HALVINGS) & jnp.isfinite(after)
             points = jnp.where(accepted, place(length), points)
             after, least = jnp.where(accepted, after, value), jnp.where(accepted, least, worst)
@@ -107,7 +107,7 @@ class Newton(Minimiser):
 
         one = jnp.ones((), points.dtype)
         start = (points, problem.least(points), jnp.inf * one, jnp.int32(0), jnp.bool_(False))
-        points, _, value, count, _ = jax.lax.while_loop(unfinished, step, start)
+        points, _, value, count, _ = jax.lax.while_loop(unfinished, step, varying_like(start, points))
         return Minimised(points, value, count)
 
 
