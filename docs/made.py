@@ -70,7 +70,8 @@ def _benchmarks(pages: dict[str, str | bytes]) -> str:
     out = ["# Benchmarks\n\nWhat was measured, each table by one command that its page names.\n"]
     for name, title in _TABLES.items():
         if (path := ROOT / "benchmarks" / f"{name}.md").exists():
-            pages[f"benchmarks/{name.lower()}.md"] = path.read_text()
+            text = re.sub(r"\[([^\]]+)\]\(\.\./[^)]*\)", r"\1", path.read_text())  # the site has no code
+            pages[f"benchmarks/{name.lower()}.md"] = text
             out.append(f"- [{title}](benchmarks/{name.lower()}.md)")
     for name, title in _NUMBERS.items():
         rows = json.loads((ROOT / "benchmarks" / f"{name}.json").read_text())["rows"]
