@@ -70,8 +70,7 @@ def _benchmarks(pages: dict[str, str | bytes]) -> str:
     out = ["# Benchmarks\n\nWhat was measured, each table by one command that its page names.\n"]
     for name, title in _TABLES.items():
         if (path := ROOT / "benchmarks" / f"{name}.md").exists():
-            text = re.sub(r"\[([^\]]+)\]\(\.\./[^)]*\)", r"\1", path.read_text())  # the site has no code
-            pages[f"benchmarks/{name.lower()}.md"] = text
+            pages[f"benchmarks/{name.lower()}.md"] = _without_code(path.read_text())
             out.append(f"- [{title}](benchmarks/{name.lower()}.md)")
     for name, title in _NUMBERS.items():
         rows = json.loads((ROOT / "benchmarks" / f"{name}.json").read_text())["rows"]
@@ -88,7 +87,12 @@ def _number(value: float | None) -> str:
 
 
 def _linked(text: str) -> str:
-    """Links from the root of the project as links from the root of the site; others lose theirs."""
+    """Links from the root of the project as links from the root of the site."""
     text = re.sub(r"\]\(docs/", "](", text)
     text = re.sub(r"\]\(benchmarks/(\w+)\.md\)", lambda found: found[0].lower(), text)
+    return _without_code(text)
+
+
+def _without_code(text: str) -> str:
+    """Text in place of links to what is not a page of the site."""
     return re.sub(r"\[([^\]]+)\]\((?!https?:|[\w/]+\.md)[^)]*\)", r"\1", text)
