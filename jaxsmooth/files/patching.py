@@ -28,6 +28,8 @@ from jaxsmooth.files.formats.table import format_named
 
 __all__ = ["patch_file"]
 
+_ROUNDING = 1e-12  # of the largest coordinate, when a copy is read again
+
 
 def patch_file(
     file: MeshFile, points: Float[np.ndarray, "nodes dim"], output: Path, format: str
@@ -106,7 +108,7 @@ def _check(
             ) from error
     found = plain(again.points)
     size = np.abs(new).max(initial=0.0)
-    same = found.shape == new.shape and np.abs(found - new).max(initial=0.0) <= patched.precision * size
+    same = found.shape == new.shape and np.abs(found - new).max(initial=0.0) <= _ROUNDING * size
     if not same:
         raise UnpatchableError("its coordinates are others when the copy is read again")
     if [cells.type for cells in again.cells] != [cells.type for cells in mesh.cells] or not all(

@@ -45,7 +45,6 @@ class Patched:
         companions: other files that belong to it, by name; they go into the same folder.
         inputs: files beside the source that must not be replaced.
         refers: files, relative to the folder of the source, that the result names and that stay there.
-        precision: to which the file holds coordinates, of the largest of them.
         proven: only bytes of coordinates are others, and stood where the old ones were found; others are
             read again before they count.
     """
@@ -55,7 +54,6 @@ class Patched:
     companions: dict[str, bytes] = field(default_factory=dict)
     inputs: tuple[Path, ...] = ()
     refers: tuple[str, ...] = ()
-    precision: float = 1e-12
     proven: bool = False
 
 

@@ -241,7 +241,7 @@ def patch_unv(
         raise UnpatchableError("its nodes don't have four numbers and three coordinates each")
     columns = slice(4, 7)
     places = Places(starts.reshape(-1, 7)[:, columns], ends.reshape(-1, 7)[:, columns])
-    return Patched(put_text(source.content, places, old, new), proven=True)
+    return Patched(put_text(source.content, places, old, new))  # in columns, so it is read again
 
 
 UNV = Format(
