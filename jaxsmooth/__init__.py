@@ -29,7 +29,7 @@ _HOMES = {
     "mesh.layers": ("boundary_layers", "stretched"),
     "mesh.links": ("NodeLinks",),
     "mesh.record": ("Labels", "Mesh"),
-    "methods": ("METHODS", "Elastic", "Laplacian", "Method", "Optimize"),
+    "methods": ("METHODS", "Elastic", "Laplacian", "Method", "Optimize", "Untangle"),
     "methods.elastic.elasticity": ("Material",),
     "methods.optimize.energy": ("Energy", "energy"),
     "methods.optimize.goals": ("Goal", "Stage", "When"),
@@ -94,6 +94,7 @@ __all__ = [
     "Statistics",
     "Status",
     "Target",
+    "Untangle",
     "When",
     "as_mesh",
     "boundary_layers",
@@ -145,7 +146,7 @@ if TYPE_CHECKING:
     from jaxsmooth.mesh.layers import boundary_layers, stretched
     from jaxsmooth.mesh.links import NodeLinks
     from jaxsmooth.mesh.record import Labels, Mesh
-    from jaxsmooth.methods import METHODS, Elastic, Laplacian, Method, Optimize
+    from jaxsmooth.methods import METHODS, Elastic, Laplacian, Method, Optimize, Untangle
     from jaxsmooth.methods.elastic.elasticity import Material
     from jaxsmooth.methods.optimize.energy import Energy, energy
     from jaxsmooth.methods.optimize.goals import Goal, Stage, When

@@ -108,12 +108,15 @@ def _smooth_one(
     report.print_comparison(out, file.mesh, result)
     worst = advice.worst_elements(file, result.mesh, held)
     advice.print_worst(out, worst)
+    tangled = advice.still_inverted(file, result.mesh, constraints, held)
+    advice.print_inverted(out, tangled)
     losses, notes = [*notes, *late], (*file.notes, *notes, *late)
     row = report.as_json(str(source), str(target), options.method, result, clock.split(), notes)
     row |= {
         "node_freedom": dict(held.counts()),
         "advice": advice.advice(held),
         "worst": worst,
+        "still_inverted": tangled,
         "losses": losses,
     }
     return _Done(file, result, row, clock.seconds)

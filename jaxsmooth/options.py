@@ -13,7 +13,7 @@ __all__ = ["GOALS", "METHODS", "check", "parse", "parser"]
 
 METHODS = (
     "elastic, elastic-extended, laplacian, smart-laplacian, weighted-laplacian, smart-weighted-laplacian, "
-    "optimize"
+    "optimize, untangle"
 )
 GOALS = ("average", "worst", "balanced")
 

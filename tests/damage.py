@@ -22,7 +22,7 @@ from jaxsmooth.cells.table import element_type
 from jaxsmooth.methods import METHODS
 from jaxsmooth.metrics.validity import inverted
 
-GUARDED = tuple(name for name in METHODS if name not in ("laplacian", "weighted-laplacian"))
+GUARDED = tuple(name for name in METHODS if name not in ("laplacian", "weighted-laplacian", "untangle"))
 SHAPES = {
     **{kind: (lambda kind=kind: grid(kind)) for kind in KINDS},
     "mixed_2d": mixed_2d,

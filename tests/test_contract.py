@@ -12,8 +12,8 @@ import jaxsmooth as js
 from jaxsmooth.methods import METHODS
 
 STEPS = 2
-GUARDED = [name for name in METHODS if name not in ("laplacian", "weighted-laplacian")]
-DIFFERENTIABLE = [name for name in METHODS if name != "optimize"]
+GUARDED = [name for name in METHODS if name not in ("laplacian", "weighted-laplacian", "untangle")]
+DIFFERENTIABLE = [name for name in METHODS if name not in ("optimize", "untangle")]
 
 
 @cache

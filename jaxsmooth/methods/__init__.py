@@ -7,8 +7,9 @@ from jaxsmooth.methods.base import Method, Proposal, Step
 from jaxsmooth.methods.elastic.method import Elastic
 from jaxsmooth.methods.laplacian import Laplacian
 from jaxsmooth.methods.optimize.method import Optimize
+from jaxsmooth.methods.optimize.untangle import Untangle
 
-__all__ = ["METHODS", "Elastic", "Laplacian", "Method", "Optimize", "Proposal", "Step"]
+__all__ = ["METHODS", "Elastic", "Laplacian", "Method", "Optimize", "Proposal", "Step", "Untangle"]
 
 METHODS: dict[str, Callable[[], Method]] = {
     "elastic": Elastic,
@@ -18,5 +19,6 @@ METHODS: dict[str, Callable[[], Method]] = {
     "weighted-laplacian": partial(Laplacian, weighted=True),
     "smart-weighted-laplacian": partial(Laplacian, smart=True, weighted=True),
     "optimize": Optimize,
+    "untangle": Untangle,
 }
 """What makes each method, by its name on the command line."""

@@ -5,16 +5,28 @@ from __future__ import annotations
 from textwrap import wrap
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
 from jaxsmooth.convert.meshfile import MeshFile
 from jaxsmooth.mesh.record import Mesh
+from jaxsmooth.methods.optimize.problem import Aggregation, movable, problem
+from jaxsmooth.metrics.shape import MEAN_RATIO
 from jaxsmooth.metrics.summary import POOR, evaluated
+from jaxsmooth.metrics.validity import inverted
+from jaxsmooth.motion.base import Motion
 from jaxsmooth.report.holding import Holding
 from jaxsmooth.report.quality import centroids
 
-__all__ = ["advice", "print_held", "print_worst", "worst_elements"]
+__all__ = [
+    "advice",
+    "print_held",
+    "print_inverted",
+    "print_worst",
+    "still_inverted",
+    "worst_elements",
+]
 
 _MOSTLY = 0.5  # part of the nodes that are held, from which on advice is given
 _HINTS = {
@@ -76,6 +88,54 @@ def worst_elements(file: MeshFile, mesh: Mesh, held: Holding, count: int = _LIST
                 place = [float(x) for x in places[element]]
                 rows.append({**row, "place": place, "nodes": held.of(np.asarray(nodes)[element])})
     return sorted(rows, key=lambda row: row["q"])[:count]
+
+
+def still_inverted(file: MeshFile, mesh: Mesh, motion: Motion, held: Holding) -> list[dict[str, Any]]:
+    """The inverted elements, those first that can't be repaired: inverted where all nodes are held.
+
+    Args:
+        file: what was read.
+        mesh: the mesh now, in the order of the file.
+        motion: what its nodes may do.
+        held: in words.
+    """
+    tangled = [np.asarray(part) for part in inverted(mesh)]
+    if not any(part.any() for part in tangled):
+        return []
+    sizes = tuple(jnp.ones(len(part), mesh.points.dtype) for part in tangled)
+    task = problem(mesh.bare, motion, sizes, Aggregation(0.0, 1.0, 1.0), MEAN_RATIO)
+    hopeless, free = task.hopeless(mesh.points), np.asarray(movable(motion.at(mesh.points)))
+    rows = []
+    for kind, now, out, nodes, places in zip(
+        mesh.types, tangled, hopeless, mesh.connectivity, centroids(file, mesh), strict=True
+    ):
+        nodes = np.asarray(nodes)
+        out = np.asarray(out).reshape(-1)[: len(nodes)] | ~free[nodes].any(axis=1)
+        rows += [
+            {
+                "type": kind,
+                "element": int(element),
+                "place": [float(x) for x in places[element]],
+                "nodes": held.of(nodes[element]),
+                "repairable": not out[element],
+            }
+            for element in np.flatnonzero(now)
+        ]
+    return sorted(rows, key=lambda row: row["repairable"])
+
+
+def print_inverted(out: Console, rows: list[dict[str, Any]]) -> None:
+    """How many, how many of them can't be repaired, and the first of both."""
+    for repairable, why in (
+        (False, "can't be repaired, for all nodes on which that depends are held"),
+        (True, "were not repaired"),
+    ):
+        some = [row for row in rows if row["repairable"] is repairable]
+        if some:
+            names = ", ".join(f"{row['type']} {row['element']}" for row in some[:_LISTED])
+            more = ", …" if len(some) > _LISTED else ""
+            out.print(f"{len(some):,} inverted elements {why}:", style="yellow")
+            out.print(f"  {names}{more}", style="yellow")
 
 
 def print_worst(out: Console, rows: list[dict[str, Any]]) -> None:

@@ -191,11 +191,13 @@ class _Driver:
     def run(self, steps: int) -> Status:
         """Make the steps; where they lead nowhere, go back and on with the stricter method."""
         self._record(self.reached.row)
+        if steps and self.reached.now.inverted and self.method.first is not None:
+            self._untangle(self.method.first)
         self.attempts = list(self.method.attempts(tangled=self.reached.now.inverted > 0))
         settled = lost = 0
         while (index := len(self.history) + len(self.waiting)) <= steps:
             before = (self.waiting or [self.reached])[-1]
-            place = self._advance(before, index)
+            place = self._advance(before, index, self.attempts[0])
             if isinstance(place, Status):
                 return place
             now = place.now
@@ -225,10 +227,18 @@ class _Driver:
                 settled = lost = 0
         return Status.STEP_LIMIT
 
-    def _advance(self, before: _Place, index: int) -> _Place | Status:
-        """One step of the present attempt, or why there is none."""
+    def _untangle(self, method: Method) -> None:
+        """A first step, with a method for tangled meshes; where it helps, the run goes on from there."""
+        place = self._advance(self.reached, 1, method)
+        if not isinstance(place, Status) and place.now.inverted < self.reached.now.inverted:
+            self.waiting.append(place)
+            if self._objection(place) is None:
+                self._accept()
+
+    def _advance(self, before: _Place, index: int, method: Method) -> _Place | Status:
+        """One step of a method, or why there is none."""
         start = time.perf_counter()
-        step = _step(self.attempts[0], before.mesh, self.motion, before.evaluation, self.state)
+        step = _step(method, before.mesh, self.motion, before.evaluation, self.state)
         if not bool(jnp.isfinite(step.points).all()):
             return Status.NOT_FINITE if bool(jnp.isfinite(step.residual)) else Status.UNSOLVED
         whole = before.whole._replace(mesh=before.mesh.with_points(step.points))

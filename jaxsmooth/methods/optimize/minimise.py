@@ -12,7 +12,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsmooth.methods.optimize.distortion import regularisation
 from jaxsmooth.methods.optimize.problem import Problem
@@ -34,6 +34,17 @@ class Minimised(NamedTuple):
     points: Field
     value: Scalar
     iterations: Int[Array, ""]
+
+
+class Taken(NamedTuple):
+    """A step: the points after it, the objective before and after, the least determinant, and whether any
+    length of it was good enough."""
+
+    points: Field
+    before: Scalar
+    after: Scalar
+    least: Scalar
+    accepted: Bool[Array, ""]
 
 
 class Minimiser(eqx.Module):
@@ -68,47 +79,57 @@ class Newton(Minimiser):
 
         def step(state):
             points, worst, _, count, _ = state
-            eps = regularisation(worst)
-            here = problem.motion.at(points)
-            value, gradient, models, blocks = problem.quadratic(points, eps)
-            gradient = here.collect(gradient)
-            inverse = block_inverse(blocks, here)
-            move = conjugate_gradients(
-                lambda w: here.collect(problem.apply(models, here.followed(w))),
-                -gradient,
-                lambda r: here.restrict(apply_blocks(inverse, r)),
-                self.cg_tolerance,
-                self.cg_iterations,
-            ).field
-            slope = jnp.vdot(gradient, move)
-
-            def place(length):  # projected again: what cancels in a sum of long moves leaves rounding
-                return problem.motion.retract(points, here.expand(length * move))
-
-            def rejected(trial):
-                length, after, least, halvings = trial
-                lower = after <= value + _SUFFICIENT * length * slope
-                valid = (least > 0) | (worst <= 0)
-                return ~(lower & valid) & (halvings < _HALVINGS)
-
-            def halve(trial):
-                length, _, _, halvings = trial
-                length = length / 2
-                return length, *problem.value(place(length), eps), halvings + 1
-
-            first = varying_like((2.0 * one, jnp.inf * one, -one, jnp.int32(-1)), points)
-            length, after, least, halvings = jax.lax.while_loop(rejected, halve, first)
-            accepted = (halvings < _HALVINGS) & jnp.isfinite(after)
-            points = jnp.where(accepted, place(length), points)
-            after, least = jnp.where(accepted, after, value), jnp.where(accepted, least, worst)
+            taken = self.step(problem, points, regularisation(worst), worst)
+            fall = taken.before - taken.after
             # while ε falls the values of two steps do not compare
-            done = ~accepted | ((value - after <= self.tolerance * jnp.abs(value)) & (least > 0))
-            return points, least, after, count + 1, done
+            little = (fall <= self.tolerance * jnp.abs(taken.before)) & (taken.least > 0)
+            return taken.points, taken.least, taken.after, count + 1, ~taken.accepted | little
 
         one = jnp.ones((), points.dtype)
         start = (points, problem.least(points), jnp.inf * one, jnp.int32(0), jnp.bool_(False))
         points, _, value, count, _ = jax.lax.while_loop(unfinished, step, varying_like(start, points))
         return Minimised(points, value, count)
+
+    def step(self, problem: Problem, points: Field, eps: Scalar, worst: Scalar) -> Taken:
+        """One step for the regularisation ε, from points whose least relative determinant is `worst`."""
+        here = problem.motion.at(points)
+        value, gradient, models, blocks = problem.quadratic(points, eps)
+        gradient = here.collect(gradient)
+        inverse = block_inverse(blocks, here)
+        move = conjugate_gradients(
+            lambda w: here.collect(problem.apply(models, here.followed(w))),
+            -gradient,
+            lambda r: here.restrict(apply_blocks(inverse, r)),
+            self.cg_tolerance,
+            self.cg_iterations,
+        ).field
+        slope = jnp.vdot(gradient, move)
+
+        def place(length):  # projected again: what cancels in a sum of long moves leaves rounding
+            return problem.motion.retract(points, here.expand(length * move))
+
+        def rejected(trial):
+            length, after, least, halvings = trial
+            lower = after <= value + _SUFFICIENT * length * slope
+            valid = (least > 0) | (worst <= 0)
+            return ~(lower & valid) & (halvings < _HALVINGS)
+
+        def halve(trial):
+            length, _, _, halvings = trial
+            length = length / 2
+            return length, *problem.value(place(length), eps), halvings + 1
+
+        one = jnp.ones((), points.dtype)
+        first = varying_like((2.0 * one, jnp.inf * one, -one, jnp.int32(-1)), points)
+        length, after, least, halvings = jax.lax.while_loop(rejected, halve, first)
+        accepted = (halvings < _HALVINGS) & jnp.isfinite(after)
+        return Taken(
+            jnp.where(accepted, place(length), points),
+            value,
+            jnp.where(accepted, after, value),
+            jnp.where(accepted, least, worst),
+            accepted,
+        )
 
 
 # --- Libraries -----------------------------------------------------------------------------------

@@ -36,7 +36,7 @@ from jaxsmooth.motion.base import Motion
 from jaxsmooth.numerics.admissible import Admissible
 from jaxsmooth.numerics.small import contract, determinant
 
-__all__ = ["Aggregation", "Problem", "problem"]
+__all__ = ["Aggregation", "Problem", "movable", "problem"]
 
 _REACH = 4.0  # pivots, beyond which the penalty is straight
 _HEAVY = 4  # memory of an element's energy, in units of a product with linear tetrahedra
