@@ -62,11 +62,6 @@ class Method(eqx.Module):
         return self
 
     @property
-    def first(self) -> Method | None:
-        """What makes the first step of a run on a tangled mesh, if not the method itself."""
-        return None
-
-    @property
     def acceptance(self) -> AcceptanceRule:
         """What a run with this method keeps of its input, unless the user says otherwise."""
         return AcceptanceRule() if self.guard is not None else AcceptanceRule.anything()

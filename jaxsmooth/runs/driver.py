@@ -16,7 +16,7 @@ from jaxsmooth.convert.meshfile import MeshFile, with_file
 from jaxsmooth.guards.acceptance import AcceptanceRule, Status
 from jaxsmooth.mesh.padding import Padded
 from jaxsmooth.mesh.record import Mesh
-from jaxsmooth.methods import Elastic, Method
+from jaxsmooth.methods import Elastic, Method, Untangle
 from jaxsmooth.metrics.evaluation import Evaluation
 from jaxsmooth.metrics.summary import Statistics, evaluate_padded, remember, summary, without_ghosts
 from jaxsmooth.motion.base import Motion
@@ -92,6 +92,8 @@ def smooth(
     callback: Callable[[StepRecord], None] | None = None,
 ) -> SmoothResult:
     """Improve a mesh by moving its nodes (Algorithm 1).
+
+    The first step on a tangled mesh is one of `Untangle`, whatever the method, unless it has no guard.
 
     Args:
         mesh: a `Mesh`, a `MeshFile`, a PyVista grid, or whatever else `as_mesh` takes.
@@ -191,8 +193,8 @@ class _Driver:
     def run(self, steps: int) -> Status:
         """Make the steps; where they lead nowhere, go back and on with the stricter method."""
         self._record(self.reached.row)
-        if steps and self.reached.now.inverted and self.method.first is not None:
-            self._untangle(self.method.first)
+        if steps and self.reached.now.inverted and self.method.guard is not None:
+            self._untangle()
         self.attempts = list(self.method.attempts(tangled=self.reached.now.inverted > 0))
         settled = lost = 0
         while (index := len(self.history) + len(self.waiting)) <= steps:
@@ -227,13 +229,19 @@ class _Driver:
                 settled = lost = 0
         return Status.STEP_LIMIT
 
-    def _untangle(self, method: Method) -> None:
-        """A first step, with a method for tangled meshes; where it helps, the run goes on from there."""
-        place = self._advance(self.reached, 1, method)
-        if not isinstance(place, Status) and place.now.inverted < self.reached.now.inverted:
+    def _untangle(self) -> None:
+        """A first step that turns elements right side out; the run goes on from there.
+
+        What is valid throughout may have to be improved before it counts.
+        """
+        place = self._advance(self.reached, 1, Untangle())
+        if isinstance(place, Status) or place.now.inverted >= self.reached.now.inverted:
+            return
+        counts = self._objection(place) is None
+        if counts or not place.now.inverted:
             self.waiting.append(place)
-            if self._objection(place) is None:
-                self._accept()
+        if counts:
+            self._accept()
 
     def _advance(self, before: _Place, index: int, method: Method) -> _Place | Status:
         """One step of a method, or why there is none."""

@@ -22,7 +22,6 @@ from jaxsmooth.methods.optimize.distortion import METRICS, check_metric
 from jaxsmooth.methods.optimize.goals import BALANCED, GOALS, UNTANGLE, Goal, When
 from jaxsmooth.methods.optimize.minimise import Minimiser, Newton
 from jaxsmooth.methods.optimize.problem import Aggregation, Problem, problem
-from jaxsmooth.methods.optimize.untangle import Untangle
 from jaxsmooth.metrics.evaluation import Evaluation
 from jaxsmooth.metrics.record import Metric
 from jaxsmooth.metrics.shape import SHAPE_AND_CORNERS
@@ -115,11 +114,6 @@ class Optimize(Method):
         rule = super().acceptance
         kept = self.goal.averaged and self.metric in METRICS
         return rule if kept else replace(rule, average=math.inf)
-
-    @property
-    def first(self) -> Method:
-        """A tangled mesh is untangled before it is optimised."""
-        return Untangle()
 
     def attempts(self, tangled: bool) -> tuple[Method, ...]:
         """The objective is trusted first, for it has a barrier of its own; then as for other methods."""
