@@ -46,6 +46,7 @@ _HOMES = {
     "motion.following": ("Following", "follow"),
     "motion.given": ("host_nearest", "on_surface"),
     "motion.planar": ("Constraints",),
+    "report.progress": ("progress",),
     "runs.batch": ("Batch", "stack"),
     "runs.design": ("Design", "design", "filter_gradient"),
     "runs.driver": ("SmoothResult", "smooth"),
@@ -115,6 +116,7 @@ __all__ = [
     "keep_compiled",
     "on_surface",
     "optimum",
+    "progress",
     "quality",
     "quality_least",
     "quality_mean",
@@ -163,6 +165,7 @@ if TYPE_CHECKING:
     from jaxsmooth.motion.following import Following, follow
     from jaxsmooth.motion.given import host_nearest, on_surface
     from jaxsmooth.motion.planar import Constraints
+    from jaxsmooth.report.progress import progress
     from jaxsmooth.runs.batch import Batch, stack
     from jaxsmooth.runs.design import Design, design, filter_gradient
     from jaxsmooth.runs.driver import SmoothResult, smooth

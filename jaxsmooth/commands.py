@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,8 +22,9 @@ from jaxsmooth.metrics.table import USUAL
 from jaxsmooth.motion.detect import detect_constraints
 from jaxsmooth.report import advice, compared, quality, report
 from jaxsmooth.report.holding import holding
+from jaxsmooth.report.progress import working
 from jaxsmooth.report.terminal import complain, sentence, write_to_standard_output
-from jaxsmooth.runs.driver import SmoothResult
+from jaxsmooth.runs.driver import SmoothResult, StepRecord
 
 __all__ = ["BAD_INPUT", "DONE", "INVERTED", "SOME_FAILED", "compare", "demo", "info", "measure", "smooth"]
 
@@ -78,7 +80,20 @@ def _smooth_one(
     options: argparse.Namespace, source: Path, target: Path, out: Console, outputs: Outputs
 ) -> _Done:
     """From file to file; the output is put in place when the outputs are committed."""
+    with working(out) as say:
+        return _from_file_to_file(options, source, target, out, outputs, say)
+
+
+def _from_file_to_file(
+    options: argparse.Namespace,
+    source: Path,
+    target: Path,
+    out: Console,
+    outputs: Outputs,
+    say: Callable[[str], None],
+) -> _Done:
     clock = report.Clock()
+    say(f"reading {source.name}")
     with clock("read"):
         file = io.read(source)
     asked: dict[str, Any] = {"file_format": choices.format_for(options.format, file.format)}
@@ -88,16 +103,22 @@ def _smooth_one(
     with clock("write"), Outputs() as trial:  # what a writer refuses, it refuses before the work
         notes = io.write_to(trial, target, file, **asked)
     _print_losses(out, notes, str(target))
+    say("finding what nodes may do")
     with clock("constraints"):
         constraints = choices.constraints_of(file, options)
         held = holding(file.mesh, constraints, choices.held_by_option(file, options))
     report.print_constraints(out, constraints, file.mesh)
     advice.print_held(out, held)
     method = choices.chosen_method(options.method, options.goal)
+    say("evaluating the mesh")
+
+    def after(row: StepRecord) -> None:
+        report.print_step(out, row)
+        say(f"step {row.step + 1}" if row.step else "compiling, and step 1")
+
     with clock("smooth"):
-        result = choices.run_method(
-            file, method, options.steps, constraints, lambda row: report.print_step(out, row)
-        )
+        result = choices.run_method(file, method, options.steps, constraints, after)
+    say(f"writing {target.name}")
     data = {}
     if options.quality_data:
         data["cell_data"] = quality.cell_data(result.mesh, quality.measured(result.mesh, USUAL))
