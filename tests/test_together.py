@@ -91,12 +91,26 @@ def test_parts_gain_more_than_where_they_are_held(name):
     assert free.q_min > held.q_min + 0.04
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", [name for name in METHODS if name != "untangle"])  # it leaves valid ones
 def test_all_methods_keep_hanging_nodes_on_their_edges(name):
     mesh = shared("02_hanging.vtu").mesh
     held, free = gain(mesh, METHODS[name](), 2)
     if name in ("elastic", "optimize"):  # the others do not promise a better average
         assert free.q_avg > held.q_avg
+
+
+def test_hanging_nodes_stay_on_their_edges_when_a_mesh_is_untangled():
+    mesh = shared("02_hanging.vtu").mesh
+    motion = js.detect_constraints(mesh)
+    free = np.flatnonzero(np.asarray(motion.at(mesh.points).freedom) == mesh.dim)
+    free = np.setdiff1d(free, mesh.labels.links.members(len(mesh.points)).nonzero()[0])
+    points = np.asarray(mesh.points).copy()
+    size = np.ptp(points, axis=0).max()
+    points[free] += np.random.default_rng(0).uniform(-0.15, 0.15, points[free].shape) * size
+    tangled = mesh.with_points(jnp.asarray(points))
+    done = js.smooth(tangled, js.Untangle(), steps=1, constraints=motion)
+    assert js.statistics(tangled).inverted > js.statistics(done.mesh).inverted
+    assert apart(mesh, done) < 1e-12 * size
 
 
 def test_optimised_periodic_mesh():
